@@ -20,7 +20,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.estimate import Estimate
-from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
+from etid.estimators.joint.terms import Joint, Loads, in_turn
 from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import changes
@@ -123,7 +123,8 @@ class Found(NamedTuple):
 
 
 def estimates(
-    study: DriverStudy,
+    model: Joint,
+    groups: Sequence[Loads],
     common: Float[Array, " common"],
     fitted: Sequence[tuple[LoadUnknowns, optx.RESULTS]],
     several: Sequence[int],
@@ -134,10 +135,9 @@ def estimates(
     `fitted` has the unknowns of the loads of each group and the results of their solvers, `several`
     the number of unloaded records in each group that several loads share.
     """
-    groups, model = study.groups, study.model
     owns = [own for own, _ in fitted]
     found = [
-        _of_group(study, loads, common, own, several=count > 0)
+        _of_group(model, loads, common, own, several=count > 0)
         for loads, own, count in zip(groups, owns, several, strict=True)
     ]
     of, pull = model.calibrations, jnp.zeros_like(common)
@@ -197,17 +197,17 @@ def estimates(
 
 
 def _of_group(
-    study: DriverStudy,
+    model: Joint,
     loads: Loads,
     common: Float[Array, " common"],
     owns: LoadUnknowns,
     several: bool,
 ) -> tuple[_Eliminated, _AtMinimum, _ByX | None]:
     """Each load of a group at its minimum, evaluated once."""
-    driver = study.model.around(common, loads.frequency[0])
+    driver = model.around(common, loads.frequency[0])
 
     def one(load: Loads, own: LoadUnknowns) -> tuple[_Eliminated, _AtMinimum, _ByX | None]:
-        at, by_x = _at_minimum(study, driver, load, own)
+        at, by_x = _at_minimum(model, driver, load, own)
         eliminated = _eliminated(at, common.size)
         return eliminated, at, _influence(by_x, eliminated) if several else None
 
@@ -215,14 +215,14 @@ def _of_group(
 
 
 def _at_minimum(
-    study: DriverStudy, driver: GivenDriver, load: Loads, own: LoadUnknowns
+    model: Joint, driver: GivenDriver, load: Loads, own: LoadUnknowns
 ) -> tuple[_AtMinimum, Float[Array, "x parameter"]]:
     """A load at its minimum, and the effect of unit noise in its X on the gradient.
 
     The noise has two numbers at each knot. A caller that does not use its effect does not compute
     it.
     """
-    lane, q = study.lane(driver, load), jnp.concatenate([own.vector(), driver.mean])
+    lane, q = load.behind(driver, model), jnp.concatenate([own.vector(), driver.mean])
     near, records, owned = lane.near(q), lane.known(q), lane.gains.owned
     profile, condensed = near.profile, near.condensed
     noise = profile.excess(records)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from etid.estimators.joint.errors import Found, estimates
 from etid.estimators.joint.near import minimum
-from etid.estimators.joint.terms import Current, DriverStudy, Joint, Loads, in_turn
+from etid.estimators.joint.terms import Current, Joint, Loads, in_turn
 from etid.estimators.maximum_likelihood import search
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.unknowns import LoadUnknowns
@@ -39,25 +39,24 @@ def fit_together(
         `shared_cov` of an estimate comes from the uncertainty of `common`, and from the noise of
         shared unloaded records.
     """
-    study = DriverStudy(model, groups)
-    common, parts, least = minimum(study)
+    common, parts, least = minimum(model, groups)
     # The loads that take no part are fitted now, with the final Z_th.
-    refitted = [_refitted(study, common, *group) for group in zip(groups, parts, strict=True)]
-    cov, found = estimates(study, common, refitted, several, least)
+    refitted = [_refitted(model, common, *group) for group in zip(groups, parts, strict=True)]
+    cov, found = estimates(model, groups, common, refitted, several, least)
     return common, cov, found
 
 
 def _refitted(
-    study: DriverStudy,
+    model: Joint,
     common: Float[Array, " common"],
     loads: Loads,
     starts: Float[Array, "load own"],
 ) -> tuple[LoadUnknowns, optx.RESULTS]:
     """Unknowns of each load at its minimum with this Z_th, and the results of the solver."""
-    driver = study.model.around(common, loads.frequency[0], slopes=False)
+    driver = model.around(common, loads.frequency[0], slopes=False)
 
     def one(load: Loads, start: Float[Array, " own"]) -> tuple[LoadUnknowns, optx.RESULTS]:
-        q, least = search.minimum(study.lane(driver, load), start)
+        q, least = search.minimum(load.behind(driver, model), start)
         return LoadUnknowns.of(q, load.current is not None), least.result
 
     return in_turn(one, loads, starts)

@@ -102,21 +102,9 @@ class Loads(eqx.Module):
         """Number of terms of all recordings."""
         return 2 * self.spectrum.x.size
 
-
-class DriverStudy(eqx.Module):
-    """All data of the fit of a driver and its loads.
-
-    Attributes:
-        model: Calibrations and structure of the loads.
-        groups: The loads, one group for each length.
-    """
-
-    model: Joint
-    groups: list[Loads]
-
-    def lane(self, driver: GivenDriver, load: Loads) -> Load:
-        """One load behind this driver."""
-        return self.model.lane(driver, load.spectrum, load.sample_rate, load.current)
+    def behind(self, driver: GivenDriver, model: Joint) -> Load:
+        """One of the loads behind this driver."""
+        return model.lane(driver, self.spectrum, self.sample_rate, self.current)
 
 
 def in_turn(one: Callable, *lanes: Any) -> Any:
