@@ -171,6 +171,7 @@ def test_profiles_keep_to_the_bounds(free, beyond):
     np.testing.assert_allclose(ends, [middle, middle + 1.96 * error], rtol=0, atol=0.4 * error)
 
 
+@pytest.mark.slow
 def test_profiles_of_other_elements_keep_to_an_upper_bound(noisy, free):
     """R_s may not be above its bound, so R_p, which has its sum with R_s, may hardly be below."""
     bound = above(free, -1.0)

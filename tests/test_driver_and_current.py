@@ -142,6 +142,7 @@ def late_record(name: str, late: float, circuit=SKIN, seed=2, **fields) -> etid.
     return early.replace(**{name: other.samples[name]})
 
 
+@pytest.mark.slow
 def test_a_lag_of_one_record_is_taken_off():
     """It was a misfit: v_out and the current were aligned together with v_th, never each alone."""
     levels: dict[str, Any] = {"snr_db": 60.0, "current_snr_db": 60.0}

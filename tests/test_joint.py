@@ -14,7 +14,7 @@ from benchmarks.failure_axes import Cole
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.joint import near
 from etid.estimators.joint.fit import fit_alone
-from etid.estimators.joint.terms import DriverStudy, Joint, Loads
+from etid.estimators.joint.terms import Joint, Loads
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
@@ -160,8 +160,7 @@ def test_the_search_at_the_knots_ends_at_the_minimum_of_all_terms(study):
         jnp.full(3, -1),
     )
     model = Joint(etid.SkinRC(), Calibrations.of(calibrated), False)
-    whole = DriverStudy(model, [loads])
-    common, [owns], least = eqx.filter_jit(near.minimum)(whole)
+    common, [owns], least = eqx.filter_jit(near.minimum)(model, [loads])
     assert least.result == optx.RESULTS.successful
     np.testing.assert_allclose(owns[2], own[2].vector(), rtol=1e-14)
 
@@ -173,7 +172,7 @@ def test_the_search_at_the_knots_ends_at_the_minimum_of_all_terms(study):
         each.append(model.calibrations.weak(common)[0])
         for i, own in enumerate(owns):
             load = jax.tree.map(lambda leaf, i=i: leaf[i], loads)
-            each.append(whole.lane(driver, load)(own))
+            each.append(load.behind(driver, model)(own))
         return jnp.concatenate(each)
 
     owns_of = owns[:2]

@@ -9,7 +9,7 @@ import etid
 from benchmarks.failure_axes import transformer
 from benchmarks.ladder import CALIBRATION, rung
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
-from etid.estimators.score_tests import missing_pole
+from etid.estimators.score_tests import of_calibrations
 from etid.results.driver import SourceImpedance
 
 
@@ -21,13 +21,13 @@ def source(gain, slope, omega, zeta):
 
 def test_sections_are_what_a_source_would_have_more():
     f = jnp.geomspace(60.0, 1e5, 40)
-    found = missing_pole.sections(f, f[-1])
-    assert found.shape == (missing_pole.GRID * len(missing_pole.DAMPINGS), 2, f.size)
+    found = of_calibrations.sections(f, f[-1])
+    assert found.shape == (of_calibrations.GRID * len(of_calibrations.DAMPINGS), 2, f.size)
     without = source(0.0, 0.0, 1.0, 1.0).response(f)
-    omegas = 2 * np.pi * np.geomspace(20.0, 3e5, missing_pole.GRID)
+    omegas = 2 * np.pi * np.geomspace(20.0, 3e5, of_calibrations.GRID)
     for number in (0, 40, 107):
-        zeta, omega = divmod(number, missing_pole.GRID)
-        of = omegas[omega], missing_pole.DAMPINGS[zeta]
+        zeta, omega = divmod(number, of_calibrations.GRID)
+        of = omegas[omega], of_calibrations.DAMPINGS[zeta]
         for which, gains in enumerate([(1.0, 0.0), (0.0, 1.0)]):
             expected = source(*gains, *of).response(f) - without
             # Rounding of 4 kohm against 1 ohm.
@@ -61,12 +61,12 @@ def test_an_order_that_is_high_enough_shows_noise_only(identified):
     @jax.jit
     def squares_of(calibrations):
         near = calibrations.near(calibrations.start())
-        return missing_pole.squares(calibrations, near, calibrations.linear(near))
+        return of_calibrations.missing_pole(calibrations, near, calibrations.linear(near))
 
     squares = []
     for seed in range(8):
         _, driver = identified(3, 3, seed)
         assert driver.verdict == "successful"
         squares.append(np.asarray(squares_of(Calibrations.of(driver))))
-    assert np.nanmax(squares) < missing_pole.SEEN
+    assert np.nanmax(squares) < of_calibrations.MISSING_POLE
     assert abs(np.nanmean(squares) - 2) < 5 * 0.22

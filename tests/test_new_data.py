@@ -80,7 +80,9 @@ def test_it_is_one_short_file():
     assert len(inspect.getsource(new_data).splitlines()) <= 60
 
 
-@pytest.mark.parametrize("kind", ["two currents", "known in series"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("two currents", marks=pytest.mark.slow), "known in series"]
+)
 def test_its_standard_errors_are_those_of_its_estimates(scene, kind):
     fits = [fit(scene, kind, seed) for seed in range(DRAWS)]
     off = [np.log(np.asarray(of.circuit.values()) / np.asarray(SKIN.values())) for of in fits]

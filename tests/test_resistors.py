@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.estimators.score_tests import resistors
+from etid.estimators.score_tests import of_calibrations
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
@@ -75,6 +75,6 @@ def test_a_resistor_of_another_unit_makes_an_implausible_driver(calibrations, r_
 
 
 def test_rough_impedances_are_within_the_factor_that_is_allowed(calibrations):
-    rough = [resistors.rough_impedance(Inspected(of), of.r_load) for of in calibrations]
+    rough = [of_calibrations.rough_impedance(Inspected(of), of.r_load) for of in calibrations]
     assert max(rough) < 1.2 * min(rough)
     assert 10e3 < min(rough) < 20e3  # |Z_th| is 12.7 kohm at 1 kHz, and rises

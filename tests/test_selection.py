@@ -209,43 +209,26 @@ def counted(tables):
     return fit, made_fits
 
 
-def test_an_ordinary_recording_costs_one_fit():
-    fit, done = counted([[made(circuit, 1000.0) for circuit in CANDIDATES]])
-    assert list(search(1, CANDIDATES, fit)[0]) == [0]
-    assert done == [(0, 0)]
-
-
 @pytest.mark.parametrize(
-    ("z", "tried"),
+    ("of_first", "tried"),
     [
-        ((3.0, *[0.0] * 8), [0, 5, 3, 4]),  # a spread: all that may have it
-        ((-3.0, *[0.0] * 8), [0]),  # a spread above a capacitor is not passive
-        ((0.0, 2.7, *[0.0] * 7), [0]),
-        ((0.0, 2.9, *[0.0] * 7), [0, 5, 3, 4]),
-        ((*[0.0] * 8, 9.0), [0]),  # a gain is no circuit
+        ({}, [0]),  # an ordinary recording costs one fit
+        ({"deviance": 1030.0, "z": (3.0, *[0.0] * 8)}, [0, 5, 3, 4]),  # a spread: all that have it
+        ({"deviance": 1030.0, "z": (-3.0, *[0.0] * 8)}, [0]),  # above a capacitor: not passive
+        ({"deviance": 1030.0, "z": (0.0, 2.7, *[0.0] * 7)}, [0]),
+        ({"deviance": 1030.0, "z": (0.0, 2.9, *[0.0] * 7)}, [0, 5, 3, 4]),
+        ({"deviance": 1030.0, "z": (*[0.0] * 8, 9.0)}, [0]),  # a gain is no circuit
+        ({"deviance": 1300.0, "name": "misfit"}, [0, 5, 3, 4]),  # all that are not simpler
+        ({"error": 0.2}, [0, 2, 1]),  # simpler ones if an element is hardly determined
     ],
 )
-def test_the_search_climbs_only_where_a_score_asks(z, tried):
+def test_the_search_goes_where_the_data_ask_to_go(of_first, tried):
     table = [made(circuit, 1000.0) for circuit in CANDIDATES]
-    table[0] = made(CANDIDATES[0], 1030.0, z=z)
-    found = search(1, CANDIDATES, counted([table])[0])
-    assert list(found[0]) == tried
-
-
-def test_a_contradicted_circuit_asks_for_all_that_are_not_simpler():
-    table = [made(circuit, 1000.0) for circuit in CANDIDATES]
-    table[0] = made(CANDIDATES[0], 1300.0, "misfit")
-    table[4] = made(CANDIDATES[4], 1100.0, "misfit", (0.0, 4.0, *[0.0] * 7))
-    found = search(1, CANDIDATES, counted([table])[0])
-    assert list(found[0]) == [0, 5, 3, 4]
-    assert best(found[0]) == 5
-
-
-def test_the_search_goes_down_if_an_element_is_hardly_determined():
-    table = [made(circuit, 1000.0) for circuit in CANDIDATES]
-    table[0] = made(CANDIDATES[0], 1000.0, error=0.2)
-    found = search(1, CANDIDATES, counted([table])[0])
-    assert list(found[0]) == [0, 2, 1]
+    table[0] = made(CANDIDATES[0], **{"deviance": 1000.0} | of_first)
+    fit, done = counted([table])
+    [found] = search(1, CANDIDATES, fit)
+    assert list(found) == tried
+    assert done == [(0, number) for number in tried]
 
 
 def test_a_search_that_takes_long_ends_with_what_was_found(monkeypatch):

@@ -8,11 +8,11 @@ import pytest
 import scipy.signal
 
 from etid import SkinRC
-from etid.estimators.steiglitz_mcbride import periodic
 from etid.estimators.steiglitz_mcbride.iteration import (
     driver_filter,
     in_time,
     iterate,
+    periodic_driver_filter,
     skin_elements,
     skin_filter,
     terminal_voltage,
@@ -129,7 +129,7 @@ def test_the_driver_is_exact_on_harmonics_of_discrete_data(exact):
     used = frequency < 0.35 * FS
     y = jnp.where(used, x * known / (known + z_th(delay_variable(frequency, FS))), 1.0)
     noise = jnp.ones_like(frequency)
-    fit = jax.jit(functools.partial(periodic.driver_filter, order=3))
+    fit = jax.jit(functools.partial(periodic_driver_filter, order=3))
     best = fit(Spectrum(frequency, x, y, noise, noise, used), r, jnp.asarray(FS))
     z = delay_variable(jnp.linspace(0.0, 0.35, 30), 1.0)
     # The regression squares nothing (QR), so errors are rounding times a condition near 1e6.

@@ -67,12 +67,6 @@ def within(
 
     If the bounds move an element so far that it would be negative, or if there is no covariance,
     all numbers are NaN.
-
-    Args:
-        circuit: Elements of the free fit.
-        cov: Their covariance [SI].
-        shared_cov: The part of it that comes from the driver.
-        bounds: The bounds.
     """
     rows = np.array([circuit.names().index(name) for name, *_ in bounds])
     lower = jnp.array([low for _, low, _ in bounds])
@@ -177,10 +171,7 @@ def limited(
 ) -> Limited | None:
     """The bounds of the elements of a fit; None without bounds.
 
-    Args:
-        circuit: The circuit.
-        bounds: Bounds of its elements.
-        outside: As in `Within`; None if the recording was not fitted.
+    `outside` is that of `Within`; None if the recording was not fitted.
     """
     if not bounds:
         return None

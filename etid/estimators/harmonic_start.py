@@ -50,14 +50,7 @@ def start_of_skin(
     sample_rate: Float[Array, ""],
     iterations: int,
 ) -> tuple[SkinRC, Float[Array, ""]]:
-    """The last iterate, whose elements may be negative, and its trigger delay [samples].
-
-    Args:
-        spectrum: Harmonics of a recording.
-        z_th: Source impedance at these harmonics [Ω].
-        sample_rate: Sampling rate of the recording [Hz].
-        iterations: Number of iterations.
-    """
+    """The last iterate, whose elements may be negative, and its trigger delay [samples]."""
     every = knots(z_th.size)
     xx = power(spectrum.x) - spectrum.variance_x
     yy = power(spectrum.y) - spectrum.variance_y

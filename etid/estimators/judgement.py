@@ -45,11 +45,7 @@ def misses(
 ) -> Bool[Array, ""]:
     """Whether the residual exceeds the noise, both in standard deviations and in volts.
 
-    Args:
-        chi2: χ² per degree of freedom of the fit.
-        error: RRSE of the fit.
-        least: Part of the signal that may remain unexplained.
-        limit: Largest χ² that noise explains.
+    A part `least` of the signal may remain unexplained, and noise explains a χ² of `limit`.
     """
     excess = error * jnp.sqrt(jnp.maximum(1 - 1 / chi2, 0.0))
     return (chi2 > limit) & (excess > least)
@@ -67,14 +63,9 @@ def judged(
     method: str,
     bounds: Limits = (),
 ) -> Fit:
-    """The fit of an estimate, with its verdict.
+    """The fit of an estimate of the logarithms of the elements, with its verdict.
 
-    Args:
-        estimate: Estimate whose parameters are the logarithms of the elements.
-        circuit: Structure of the load.
-        driver_result: Verdict of the driver.
-        method: Name of the estimator.
-        bounds: Bounds of elements; those of elements that the circuit lacks do not count.
+    Bounds of elements that the circuit lacks do not count.
     """
     fitted = circuit.with_log_values(estimate.parameters)
     values = fitted.values()

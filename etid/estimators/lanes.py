@@ -22,7 +22,7 @@ from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
 from etid.signals.harmonics import ALIASED, Spectrum, aliases, joins_aliases, spectrum
-from etid.signals.noise import Measurement, coloured, measure, noise, rounding_variance
+from etid.signals.noise import Measurement, coloured, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
@@ -70,23 +70,8 @@ class AbstractLane(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def of_samples(
-        cls,
-        v_th: Float[Array, " time"],
-        v_out: Float[Array, " time"],
-        resolution: Float[Array, ""],
-        sample_rate: Float[Array, ""],
-        periods: tuple[int, int],
-    ) -> "AbstractLane":
-        """The lane of bare arrays; JAX can trace this function.
-
-        Args:
-            v_th: Unloaded voltage [V].
-            v_out: Loaded voltage [V].
-            resolution: Step of the converter [V], 0 if not known.
-            sample_rate: Sampling rate [Hz].
-            periods: Numbers of periods and samples from `whole_periods`.
-        """
+    def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "AbstractLane":
+        """The lane of bare arrays, `periods` from `whole_periods`; JAX can trace this function."""
 
     @property
     def size(self) -> int:
@@ -173,28 +158,21 @@ class Harmonics(AbstractLane):
         return frequency, x, y, *variances, selected, rate
 
     @classmethod
-    def of_samples(
-        cls,
-        v_th: Float[Array, " time"],
-        v_out: Float[Array, " time"],
-        resolution: Float[Array, ""],
-        sample_rate: Float[Array, ""],
-        periods: tuple[int, int],
-    ) -> "Harmonics":
+    def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "Harmonics":
         """The harmonics of bare arrays.
 
         Raises:
             ValueError: The arrays hold no whole period.
         """
         if periods[0] == 0:
-            raise ValueError(f"{v_out.shape[0]} samples hold no whole pulse period")
-        sigmas = noise(v_th, resolution), noise(v_out, resolution)
-        fields = map(jnp.asarray, spectrum(v_th, v_out, *sigmas, sample_rate, *periods))
+            raise ValueError(f"{m.v_out.shape[0]} samples hold no whole pulse period")
+        records = m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate
+        fields = map(jnp.asarray, spectrum(*records, *periods))
         frequency, x, y, of_x, of_y, selected = fields
         if joins_aliases(*periods):
             of_x = of_x + aliases(x, of_x, *periods).variance
             of_y = of_y + aliases(y, of_y, *periods).variance
-        return cls(frequency, x, y, of_x, of_y, selected, sample_rate)
+        return cls(frequency, x, y, of_x, of_y, selected, m.sample_rate)
 
     @property
     def spectrum(self) -> Spectrum:
@@ -259,14 +237,7 @@ class HarmonicsWithCurrent(Harmonics):
         return *of_voltages, selected & usable, rate, turned, variance_i
 
     @classmethod
-    def of_samples(
-        cls,
-        v_th: Float[Array, " time"],
-        v_out: Float[Array, " time"],
-        resolution: Float[Array, ""],
-        sample_rate: Float[Array, ""],
-        periods: tuple[int, int],
-    ) -> "HarmonicsWithCurrent":
+    def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "HarmonicsWithCurrent":
         """Refused: bare arrays have no current."""
         raise ValueError("arrays have no current; use method='maximum_likelihood'")
 
@@ -288,8 +259,8 @@ class HarmonicsWithCurrent(Harmonics):
         return Lags.of(self._behind(gain, self.y, self.variance_y), of_current)
 
 
-class PaddedSamples(AbstractLane):
-    """Samples, padded with zeros to one of a few lengths.
+class AlignedSamples(AbstractLane):
+    """The overlap of both records after the alignment.
 
     Attributes:
         v_th: Unloaded voltage [V].
@@ -297,8 +268,7 @@ class PaddedSamples(AbstractLane):
         sigma_th: Noise of `v_th` [V].
         sigma_out: Noise of `v_out` [V].
         sample_rate: Sampling rate [Hz].
-        samples: Number of recorded samples; zeros follow them.
-        harmonics: Harmonics for a score test; None if the record does not hold whole periods.
+        samples: Number of recorded samples; zeros may follow them.
     """
 
     v_th: Float[Array | np.ndarray, "*lane time"]
@@ -307,43 +277,45 @@ class PaddedSamples(AbstractLane):
     sigma_out: Float[Array | np.ndarray, "*lane"]
     sample_rate: Float[Array | np.ndarray, "*lane"]
     samples: Int[Array | np.ndarray, "*lane"]
+
+    @classmethod
+    def of(cls, seen: Inspected) -> "AlignedSamples":
+        """The aligned records of a recording."""
+        v_th, v_out = seen.aligned
+        of_th, of_out = map(np.asarray, seen.trusted)
+        rate = np.asarray(seen.recording.sample_rate)
+        return cls(v_th, v_out, of_th, of_out, rate, np.asarray(v_th.size))
+
+    @classmethod
+    def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "AlignedSamples":
+        """The lane of bare arrays."""
+        del periods
+        known = m.sigma_th, m.sigma_out, m.sample_rate
+        return cls(m.v_th, m.v_out, *known, jnp.asarray(m.v_out.shape[0]))
+
+    def measure(self) -> Measurement:
+        """Both records and their noise, as arrays of JAX."""
+        fields = (self.v_th, self.v_out, self.sigma_th, self.sigma_out, self.sample_rate)
+        return Measurement(*map(jnp.asarray, fields))
+
+
+class PaddedSamples(AlignedSamples):
+    """The same, padded with zeros to one of a few lengths.
+
+    Attributes:
+        harmonics: Harmonics for a score test; None if the record does not hold whole periods.
+    """
+
     harmonics: Harmonics | None = None
 
     @classmethod
     def of(cls, seen: Inspected) -> "PaddedSamples":
         """The aligned samples of a recording."""
-        size = seen.v_th.size
-        room = math.ceil(2 ** (math.ceil(STEPS * math.log2(size)) / STEPS)) - size
-        one = cls(
-            v_th=np.pad(seen.v_th, (0, room)),
-            v_out=np.pad(seen.v_out, (0, room)),
-            sigma_th=np.asarray(seen.trusted[0]),
-            sigma_out=np.asarray(seen.trusted[1]),
-            sample_rate=np.asarray(seen.recording.sample_rate),
-            samples=np.asarray(size),
-        )
-        one = one.realigned(Lags(seen.lag))
-        return dataclasses.replace(one, harmonics=Harmonics.of(seen) if seen.is_periodic else None)
-
-    @classmethod
-    def of_samples(
-        cls,
-        v_th: Float[Array, " time"],
-        v_out: Float[Array, " time"],
-        resolution: Float[Array, ""],
-        sample_rate: Float[Array, ""],
-        periods: tuple[int, int],
-    ) -> "PaddedSamples":
-        """The lane of bare arrays, without padding."""
-        del periods
-        sigmas = jnp.asarray(noise(v_th, resolution)), jnp.asarray(noise(v_out, resolution))
-        return cls(v_th, v_out, *sigmas, sample_rate, jnp.asarray(v_out.shape[0]))
-
-    @property
-    def measurement(self) -> Measurement:
-        """Both records and their noise, as arrays of JAX."""
-        fields = (self.v_th, self.v_out, self.sigma_th, self.sigma_out, self.sample_rate)
-        return Measurement(*map(jnp.asarray, fields))
+        length = math.ceil(2 ** (math.ceil(STEPS * math.log2(seen.v_th.size)) / STEPS))
+        one = AlignedSamples.of(seen)
+        v_th, v_out = (np.pad(v, (0, length - one.size)) for v in (one.v_th, one.v_out))
+        known = one.sigma_th, one.sigma_out, one.sample_rate, one.samples
+        return cls(v_th, v_out, *known, Harmonics.of(seen) if seen.is_periodic else None)
 
     def realigned(self, late: Lags) -> "PaddedSamples":
         """The overlap of both records, with `v_out` advanced by whole samples."""
@@ -370,48 +342,6 @@ class PaddedSamples(AbstractLane):
         # The weight emphasises the edges, like a derivative of both records.
         weight = (frequency < ALIASED * rate) / (frequency**-2.0 * (1 + np.abs(gain) ** 2))
         return Lags.of(rest(gain * x, y, weight, 2 * np.pi * frequency / rate))
-
-
-class AlignedSamples(AbstractLane):
-    """The overlap of both records after the alignment, without padding.
-
-    Attributes:
-        v_th: Unloaded voltage [V].
-        v_out: Loaded voltage [V].
-        resolution_th: Converter step of `v_th` [V], 0 if not known.
-        resolution_out: Converter step of `v_out` [V], 0 if not known.
-        sample_rate: Sampling rate [Hz].
-    """
-
-    v_th: Float[Array | np.ndarray, "*lane time"]
-    v_out: Float[Array | np.ndarray, "*lane time"]
-    resolution_th: Float[Array | np.ndarray, "*lane"]
-    resolution_out: Float[Array | np.ndarray, "*lane"]
-    sample_rate: Float[Array | np.ndarray, "*lane"]
-
-    @classmethod
-    def of(cls, seen: Inspected) -> "AlignedSamples":
-        """The aligned records of a recording."""
-        of_th, of_out = map(np.asarray, seen.step)
-        return cls(*seen.aligned, of_th, of_out, np.asarray(seen.recording.sample_rate))
-
-    @classmethod
-    def of_samples(
-        cls,
-        v_th: Float[Array, " time"],
-        v_out: Float[Array, " time"],
-        resolution: Float[Array, ""],
-        sample_rate: Float[Array, ""],
-        periods: tuple[int, int],
-    ) -> "AlignedSamples":
-        """The lane of bare arrays."""
-        del periods
-        return cls(v_th, v_out, resolution, resolution, sample_rate)
-
-    def measure(self) -> Measurement:
-        """Both records and the noise that JAX estimates from them."""
-        fields = self.v_th, self.v_out, self.resolution_th, self.resolution_out, self.sample_rate
-        return measure(*map(jnp.asarray, fields))
 
 
 def _gain(

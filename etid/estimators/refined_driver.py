@@ -1,6 +1,7 @@
 """Refined Z_th: fits from several starts; the best result is kept and judged."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +15,14 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import driver as maximum_likelihood
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
-from etid.estimators.score_tests import missing_pole, resistors
+from etid.estimators.score_tests import of_calibrations
 from etid.estimators.starts import source_starts
-from etid.estimators.steiglitz_mcbride import iteration, periodic
+from etid.estimators.steiglitz_mcbride import iteration
 from etid.results.driver import Calibration, ContinuousDriver, HarmonicDriver, SourceImpedance
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.knots import banded
 from etid.signals.noise import Measurement
+from etid.signals.transfer import Rational
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
@@ -44,15 +46,9 @@ def from_harmonics(
     """Refine Z_th by maximum likelihood.
 
     The fits from all starts use bands of harmonics. The best is refined with all harmonics.
-
-    Args:
-        records: Calibrations, stacked along a leading axis.
-        r_load: Resistor of each calibration [Ω].
-        order: Number of poles.
-        method: Name of the estimator.
     """
     spectra, rate = records.spectrum, jnp.asarray(records.sample_rate)[0]
-    baseline = periodic.driver_filter(spectra, r_load, rate, order)
+    baseline = iteration.periodic_driver_filter(spectra, r_load, rate, order)
     bands = banded(spectra)
 
     def fit(start: SourceImpedance) -> maximum_likelihood.Rough:
@@ -68,27 +64,20 @@ def from_harmonics(
         spectra, r_load, rate, candidates
     )
     source, calibration = calibrations.source, calibrations.calibration
-    statistic = missing_pole.largest(calibrations, near, linear)
+    statistic = jnp.nanmax(of_calibrations.missing_pole(calibrations, near, linear))
     if r_load.size > 1:
-        off = resistors.mismatch(calibrations, near, linear)
+        off = of_calibrations.mismatch(calibrations, near, linear)
         calibration = dataclasses.replace(calibration, mismatch=off)
     terms = 2 * jnp.sum(spectra.selected, dtype=rate.dtype)
     passive = _is_passive(source, estimate.cov, rate)
     return HarmonicDriver(
-        b=baseline.filter.num,
-        a=baseline.filter.den,
-        sample_rate=rate,
+        **_fields(baseline.filter, estimate, rate),
         source=source,
-        cov=estimate.cov,
         calibration=calibration,
-        rrse=estimate.rrse,
-        chi2=estimate.chi2,
         result=first_verdict(
             *_faults(estimate, calibration, passive, terms),
-            (statistic > missing_pole.SEEN, RESULTS.order_too_low),
+            (statistic > of_calibrations.MISSING_POLE, RESULTS.order_too_low),
         ),
-        steps=estimate.steps,
-        remarks=remarks(estimate.hum),
         method=method,
         spectra=spectra,
         missing_pole=statistic,
@@ -98,14 +87,7 @@ def from_harmonics(
 def from_samples(
     m: Measurement, r_load: Float[Array, " record"], order: int, method: str
 ) -> ContinuousDriver:
-    """Refine Z_th by output error.
-
-    Args:
-        m: Calibrations, stacked along a leading axis.
-        r_load: Resistor of each calibration [Ω].
-        order: Number of poles.
-        method: Name of the estimator.
-    """
+    """Refine Z_th by output error."""
     rate = m.sample_rate[0]
     baseline = iteration.driver_filter(m.v_th, m.v_out, r_load, order).filter
     records = jax.vmap(prediction.prepare)(m)
@@ -122,19 +104,26 @@ def from_samples(
     source, estimate, calibration = jax.tree.map(lambda leaf: leaf[chosen], found)
     terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
     return ContinuousDriver(
-        b=baseline.num,
-        a=baseline.den,
-        sample_rate=rate,
+        **_fields(baseline, estimate, rate),
         source=source,
-        cov=estimate.cov,
         calibration=calibration,
-        rrse=estimate.rrse,
-        chi2=estimate.chi2,
         result=first_verdict(*_faults(estimate, calibration, passive[chosen], terms)),
-        steps=estimate.steps,
-        remarks=remarks(estimate.hum),
         method=method,
     )
+
+
+def _fields(baseline: Rational, estimate: Estimate, rate: Float[Array, ""]) -> dict[str, Any]:
+    """What the drivers of both methods have from their baseline and their estimate."""
+    return {
+        "b": baseline.num,
+        "a": baseline.den,
+        "sample_rate": rate,
+        "cov": estimate.cov,
+        "rrse": estimate.rrse,
+        "chi2": estimate.chi2,
+        "steps": estimate.steps,
+        "remarks": remarks(estimate.hum),
+    }
 
 
 def _is_passive(
@@ -166,7 +155,7 @@ def _faults(
     settled = estimate.result == optx.RESULTS.successful
     wrong = jnp.array(False)
     if calibration.mismatch is not None:
-        wrong = resistors.disagree(calibration.mismatch, estimate.chi2, terms)
+        wrong = of_calibrations.disagree(calibration.mismatch, estimate.chi2, terms)
     return [
         (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
         (wrong, RESULTS.resistors_disagree),

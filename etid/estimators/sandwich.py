@@ -1,16 +1,17 @@
 """The "sandwich": covariance of a fit whose noise differs from the expected noise.
 
-    cov = H⁻¹ (J C Jᵀ) H⁻¹,      H = J W Jᵀ + P
+    cov = H⁻¹ (J C Jᵀ + P) H⁻¹,      H = J W Jᵀ + P
 
 J are the derivatives of the terms with respect to the parameters, and C is the variance of each
 term. W is the share of signal in each term; without it, noise would count as information. P is the
-curvature of the priors that are not among the terms (White 1980, "A heteroskedasticity-consistent
-covariance matrix estimator", Econometrica 48).
+curvature of the priors, which is also the covariance of their gradient (White 1980, "A
+heteroskedasticity-consistent covariance matrix estimator", Econometrica 48).
 """
 
 import dataclasses
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from etid.solvers.matrices import inverse, inverse_root
@@ -21,14 +22,14 @@ class Curvature(eqx.Module):
 
     Attributes:
         expected: H.
-        score: J C Jᵀ, the covariance of the gradient.
+        score: J C Jᵀ + P, the covariance of the gradient.
     """
 
     expected: Float[Array, "n n"]
     score: Float[Array, "n n"]
 
     def covariance(self) -> Float[Array, "n n"]:
-        """H⁻¹ (J C Jᵀ) H⁻¹."""
+        """H⁻¹ (J C Jᵀ + P) H⁻¹."""
         bread = inverse(self.expected)
         return bread @ self.score @ bread
 
@@ -52,17 +53,25 @@ class Linear(eqx.Module):
         jacobian: J.
         share: Diagonal of W.
         noise: Diagonal of C.
-        prior: P; None if all priors are among the terms.
+        priors: Transposed Jacobian of the terms of the priors; None if they are among the others.
     """
 
     jacobian: Float[Array, "q term"]
     share: Float[Array, " term"]
     noise: Float[Array, " term"]
-    prior: Float[Array, "q q"] | None = None
+    priors: Float[Array, "q prior"] | None = None
+
+    @property
+    def precision(self) -> Float[Array, "q q"]:
+        """P."""
+        if self.priors is None:
+            return jnp.zeros((len(self.jacobian), len(self.jacobian)))
+        return self.priors @ self.priors.T
 
     def curvature(self) -> Curvature:
-        """H and J C Jᵀ."""
-        return Curvature(self._expected(), (self.jacobian * self.noise[None, :]) @ self.jacobian.T)
+        """H and J C Jᵀ + P."""
+        score = (self.jacobian * self.noise[None, :]) @ self.jacobian.T
+        return Curvature(self._expected(), score + self.precision)
 
     def bread(self) -> Float[Array, "q q"]:
         """H⁻¹, by Cholesky's factors: eigenvectors take five times as long."""
@@ -71,17 +80,32 @@ class Linear(eqx.Module):
 
     def covariance(self) -> Float[Array, "q q"]:
         """The sandwich, from the effect of each term on the parameters: loses fewest digits."""
-        by_term = self.bread() @ self.jacobian
-        return (by_term * self.noise[None, :]) @ by_term.T
+        bread = self.bread()
+        by_term = bread @ self.jacobian
+        cov = (by_term * self.noise[None, :]) @ by_term.T
+        if self.priors is None:
+            return cov
+        by_prior = bread @ self.priors
+        return cov + by_prior @ by_prior.T
 
     def told(self, rows: Float[Array, "row term"]) -> Float[Array, "row q"]:
         """R W Jᵀ: products of other derivatives R of the terms with those of the parameters."""
         return (rows * self.share[None, :]) @ self.jacobian.T
 
+    def projected(
+        self, rows: Float[Array, "row term"], covariance: Float[Array, "q q"] | None = None
+    ) -> tuple[Float[Array, "row term"], Float[Array, "row q"]]:
+        """Other derivatives R without what the parameters can do of them, and what these do then.
+
+        `covariance` is the inverse of the information if other terms contribute to it.
+        """
+        others = self.told(rows) @ (self.bread() if covariance is None else covariance)
+        return rows - others @ self.jacobian, others
+
     def along(self, directions: Float[Array, "q z"]) -> "Linear":
-        """The terms with coordinates along these directions as parameters, without a prior."""
-        return dataclasses.replace(self, jacobian=directions.T @ self.jacobian, prior=None)
+        """The terms with coordinates along these directions as parameters."""
+        priors = None if self.priors is None else directions.T @ self.priors
+        return dataclasses.replace(self, jacobian=directions.T @ self.jacobian, priors=priors)
 
     def _expected(self) -> Float[Array, "q q"]:
-        told = self.told(self.jacobian)
-        return told if self.prior is None else told + self.prior
+        return self.told(self.jacobian) + self.precision

@@ -29,10 +29,6 @@ def circuit_starts(
 
     Other circuits than SkinRC get the resistance at low frequency and the time constant of the
     estimate. From typical values alone, a noisy recording can lead to a capacitor of 0.
-
-    Args:
-        circuit: Structure and typical values.
-        estimate: Skin of one relaxation, as Steiglitz-McBride estimates it.
     """
     typical = circuit.log_values()
     level, time = circuit.scaling()
@@ -64,14 +60,9 @@ def current_starts(
 ) -> Float[Array, "start element"]:
     """Starts of the elements' logarithms from a measured current, one for each time scale.
 
-    The records show |Z| = |Y/X|. So the impedance level of each start is known. The means are over
+    The records are Fourier coefficients X of the current and Y of the voltage, with E|noise|² of
+    both. They show |Z| = |Y/X|. So the impedance level of each start is known. The means are over
     ln f, because the lines of a spectrum are denser at high frequencies.
-
-    Args:
-        frequency: Positive frequencies [Hz].
-        records: Fourier coefficients X of the current and Y of the voltage.
-        variances: E|noise|² of both.
-        circuit: Structure and typical values.
     """
     x, y = records
     shown = signal_share(x, variances[0]) * signal_share(y, variances[1])
@@ -94,14 +85,7 @@ def harmonic_starts(
     z_th: Complex[Array, " harmonic"],
     circuit: AbstractCircuit,
 ) -> LoadUnknowns:
-    """Starts of a fit on harmonics, stacked; the likeliest is the last.
-
-    Args:
-        spectrum: One recording.
-        sample_rate: Its sampling rate [Hz].
-        z_th: Source impedance at its harmonics [Ω].
-        circuit: Structure and typical values.
-    """
+    """Starts of a fit on harmonics, stacked; the likeliest is the last."""
     skin, delay = start_of_skin(spectrum, z_th, sample_rate, START_STEPS)
     starts = circuit_starts(circuit, skin)
     return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(delay))
@@ -116,13 +100,8 @@ def source_starts(
     """Starts of Z_th, stacked: three generic ones, and one with the resonance of the baseline.
 
     Each start has one slow real pole, and sections with given frequencies and damping ratios. All
-    gains have the size of a tenth of the known resistor.
-
-    Args:
-        baseline: Denominator of a discrete Z_th.
-        order: Number of poles.
-        sample_rate: Sampling rate [Hz].
-        r_load: The known resistor [Ω].
+    gains have the size of a tenth of the known resistor. The baseline is the denominator of a
+    discrete Z_th.
     """
     sections = (order - 1) // 2
     reals = order - 2 * sections

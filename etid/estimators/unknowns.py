@@ -3,6 +3,8 @@
 A solver uses one vector. Only `of` and `vector` of these classes know its order.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -13,52 +15,29 @@ class LoadUnknowns(eqx.Module):
 
     Attributes:
         log_elements: Logarithms of the elements of the circuit [SI].
-        delay_samples: Trigger delay of the recording [samples].
+        delay_samples: Trigger delay of V_out [samples].
+        current_delay_samples: That of a current that was measured beside V_th; None without.
     """
 
     log_elements: Float[Array, "*lane element"]
     delay_samples: Float[Array, "*lane"]
+    current_delay_samples: Float[Array, "*lane"] | None = None
 
     @classmethod
-    def of(cls, vector: Float[Array, "*lane own"]) -> "LoadUnknowns":
+    def of(cls, vector: Float[Array, "*lane own"], with_current: bool = False) -> "LoadUnknowns":
         """The unknowns, or other numbers by name, from a vector in the solver's order."""
+        if with_current:
+            return cls(vector[..., :-2], vector[..., -2], vector[..., -1])
         return cls(vector[..., :-1], vector[..., -1])
 
-    def vector(self) -> Float[Array, "*lane own"]:
-        """The vector for a solver."""
-        return jnp.concatenate([self.log_elements, self.delay_samples[..., None]], axis=-1)
-
-    def delays(self) -> tuple[float, ...]:
-        """The delay of one recording, that is not traced [samples]."""
-        return (float(self.delay_samples),)
-
-
-class LoadWithCurrentUnknowns(eqx.Module):
-    """Unknowns of a load and a recording that measured the current beside V_th.
-
-    Attributes:
-        log_elements: Logarithms of the elements of the circuit [SI].
-        delay_samples: Trigger delay of V_out [samples].
-        current_delay_samples: Trigger delay of the current [samples].
-    """
-
-    log_elements: Float[Array, "*lane element"]
-    delay_samples: Float[Array, "*lane"]
-    current_delay_samples: Float[Array, "*lane"]
-
-    @classmethod
-    def of(cls, vector: Float[Array, "*lane own"]) -> "LoadWithCurrentUnknowns":
-        """The unknowns, or other numbers by name, from a vector in the solver's order."""
-        return cls(vector[..., :-2], vector[..., -2], vector[..., -1])
+    def delays(self) -> tuple[Any, ...]:
+        """The delays of V_out and of the current [samples]."""
+        each = (self.delay_samples, self.current_delay_samples)
+        return tuple(one for one in each if one is not None)
 
     def vector(self) -> Float[Array, "*lane own"]:
         """The vector for a solver."""
-        delays = jnp.stack([self.delay_samples, self.current_delay_samples], axis=-1)
-        return jnp.concatenate([self.log_elements, delays], axis=-1)
-
-    def delays(self) -> tuple[float, ...]:
-        """The delays of one recording, of V_out and of the current; they are not traced."""
-        return float(self.delay_samples), float(self.current_delay_samples)
+        return jnp.concatenate([self.log_elements, jnp.stack(self.delays(), axis=-1)], axis=-1)
 
 
 class Nuisance(eqx.Module):
@@ -78,11 +57,6 @@ class Nuisance(eqx.Module):
     def of(cls, vector: Float[Array, "*lane nuisance"]) -> "Nuisance":
         """The unknowns from the vector of a solver."""
         return cls(vector[..., :-2], vector[..., -2], vector[..., -1])
-
-    def vector(self) -> Float[Array, "*lane nuisance"]:
-        """The vector for a solver."""
-        last = jnp.stack([self.offset, self.delay_samples], axis=-1)
-        return jnp.concatenate([self.state, last], axis=-1)
 
 
 class DriverUnknowns(eqx.Module):

@@ -20,7 +20,7 @@ from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.estimator import description
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import check_distinct, circuit_of, driver_of, fed
 from etid.identify.arguments import recordings as list_of
@@ -64,7 +64,7 @@ def leaves_much(chi2: Float[Array, ""], rrse: Float[Array, ""]) -> Bool[Array, "
 @program
 def _fit(
     lanes: Harmonics,
-    known: AbstractGiven,
+    known: GivenDriver,
     feed: HarmonicDriver | MeasuredCurrent,
     circuit: AbstractCircuit,
     prior: ElementPrior | None,

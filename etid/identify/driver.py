@@ -12,7 +12,7 @@ from jaxtyping import Array, Complex, Float
 from etid.estimators.estimator import AbstractEstimator, serving
 from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
 from etid.estimators.registry import Method
-from etid.estimators.score_tests import resistors
+from etid.estimators.score_tests import of_calibrations
 from etid.identify import changes
 from etid.identify.arguments import check_distinct, recordings
 from etid.identify.one import checksum, needs_another, of_both
@@ -113,8 +113,8 @@ def calibrated(
     seen = [Inspected(record) for record in records]
     for one in seen:
         _refused(one, preflight(one, periodic=asked is not None and asked.lane.periodic))
-    rough = [resistors.rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
-    if max(rough) > resistors.ROUGHLY * min(rough):
+    rough = [of_calibrations.rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
+    if max(rough) > of_calibrations.ROUGHLY * min(rough):
         shown = ", ".join(
             f"{one.recording.path!r} {z / 1e3:.3g} kohm" for one, z in zip(seen, rough, strict=True)
         )

@@ -141,7 +141,7 @@ def _together(
     power, _ = model.circuit.scaling()
 
     def fit(found: Found) -> Fit:
-        estimate, wrong = found.estimate, found.wrong
+        estimate = found.estimate
         moved = power + found.by_scale  # a measured current holds the elements back, or a prior
         if model.prior is not None:
             moved = moved - estimate.cov @ (model.prior.precision * power)
@@ -150,8 +150,8 @@ def _together(
             estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
         )
         fit = judgement.judged(with_scale, model.circuit, driver.result, METHOD, model.bounds)
-        fit = judgement.unless(fit, wrong.scale, RESULTS.inconsistent)
-        return judgement.unless(fit, wrong.other, RESULTS.misfit)
+        fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)
+        return judgement.unless(fit, found.other, RESULTS.misfit)
 
     of_driver = model.calibrations.named(common)
     kept = of_driver.source.size
@@ -283,7 +283,12 @@ def _late_by(lanes: Sequence[AbstractLane], starts: Sequence[_Start]) -> dict[in
     del lanes
     # A fit allows for one sample.
     late = {
-        row: Lags(*(round(by) if 1 < abs(by) < np.inf else 0 for by in start.loads.own.delays()))
+        row: Lags(
+            *(
+                round(by) if 1 < abs(by) < np.inf else 0
+                for by in map(float, start.loads.own.delays())
+            )
+        )
         for row, start in enumerate(starts)
     }
     return {row: by for row, by in late.items() if any(by)}

@@ -34,7 +34,7 @@ from etid.estimators.element_limits import Limits, of_circuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import minimum as least
@@ -64,7 +64,7 @@ class Known(eqx.Module):
         bounds: Bounds of elements.
     """
 
-    driver: AbstractGiven
+    driver: GivenDriver
     elements: ElementPrior | None
     bounds: Limits = eqx.field(static=True, default=())
 
@@ -95,7 +95,7 @@ class Minimum(eqx.Module):
 def terms_of(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Load:
     """The residuals of a recording."""
     rate, records = jnp.asarray(lane.sample_rate), Records.of(lane.spectrum)
-    if isinstance(lane, HarmonicsWithCurrent) and isinstance(known.driver, GivenDriver):
+    if isinstance(lane, HarmonicsWithCurrent) and not known.driver.by_current:
         records = Records.of(lane.spectrum, (jnp.asarray(lane.i), jnp.asarray(lane.variance_i)))
     return Load.behind(known.driver, circuit, records, rate, known.elements)
 

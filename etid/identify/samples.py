@@ -17,6 +17,7 @@ from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
 from etid.signals.harmonics import whole_periods
+from etid.signals.noise import Measurement, noise
 
 
 @in_float64
@@ -67,7 +68,8 @@ def identify_samples(
     v_th, v_out, step, rate = (
         jnp.asarray(value, float) for value in (v_th, v_out, resolution, sample_rate)
     )
-    lane = estimator.lane.of_samples(v_th, v_out, step, rate, periods)
+    of_th, of_out = (jnp.asarray(noise(v, step)) for v in (v_th, v_out))
+    lane = estimator.lane.of_samples(Measurement(v_th, v_out, of_th, of_out, rate), periods)
     known = (
         estimator.known(driver, jnp.asarray(lane.frequency), True)
         if isinstance(lane, Harmonics)

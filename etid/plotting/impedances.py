@@ -12,7 +12,7 @@ from etid.numpy_tier.tiers import program
 from etid.plotting.style import COLOURS, DASHES, Canvas, plain_ticks, titled
 from etid.results.driver import Driver, SourceImpedance
 from etid.results.fit import Fit
-from etid.solvers.propagation import log_stderr
+from etid.solvers.matrices import log_stderr
 
 LOWEST, HIGHEST = 60.0, 100e3  # [Hz] the paper's pulse rate and half its sample rate
 POINTS = 300

@@ -381,7 +381,7 @@ class HarmonicDriver(ContinuousDriver):
             with another checksum shares no unloaded record with them. Its fit then skips the
             search for what they share, which doubles the cost.
         missing_pole: Largest score statistic of one more section
-            (`etid.estimators.score_tests.missing_pole`).
+            (`etid.estimators.score_tests.of_calibrations`).
     """
 
     _: dataclasses.KW_ONLY

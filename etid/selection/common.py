@@ -16,12 +16,7 @@ DESERVED = 10.0  # 2 log evidence from which on a recording deserves a circuit o
 
 
 def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) -> int:
-    """Number of the candidate with the largest joint evidence; the first one if nothing is known.
-
-    Args:
-        found: The choices of single recordings.
-        candidates: The circuits by number.
-    """
+    """Number of the candidate with the largest joint evidence; 0 if nothing is known."""
     if all(len(selection.fits) == 1 for selection in found):
         return 0  # no recording asked for another circuit than the first
     known = [one for one in found if math.isfinite(bic(one.fits)[one.chosen])]
@@ -59,9 +54,7 @@ def _losses(selection: Selection, candidates: Sequence[AbstractCircuit]) -> list
 def deserves(selection: Selection, chosen: int) -> str:
     """A sentence if a recording deserves another circuit than the common one; otherwise empty.
 
-    Args:
-        selection: The fits of this recording, among them that of the common circuit.
-        chosen: Number of the common circuit.
+    The fits of the recording contain that of the common circuit, whose number is `chosen`.
     """
     criterion = bic(selection.fits)
     own = best(selection.fits, criterion)

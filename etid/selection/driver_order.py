@@ -55,22 +55,15 @@ class TriedOrder:
 
 
 def best(tried: Sequence[TriedOrder]) -> TriedOrder:
-    """The adequate order with the smallest BIC; if none is adequate, the smallest BIC of all.
-
-    Args:
-        tried: At least one order, the lowest first.
-    """
+    """The adequate order with the smallest BIC; if none is adequate, the smallest BIC of all."""
     adequate = [one for one in tried if one.adequate]
     return min(adequate or tried, key=lambda one: one.bic)
 
 
 def next_order(tried: Sequence[TriedOrder]) -> int | None:
-    """The next order to fit; None if the search is over.
+    """The next order to fit, of those above the last of `tried`; None if the search is over.
 
     A section has two poles. The search therefore ends only after two more poles without a gain.
-
-    Args:
-        tried: The orders so far, the lowest first.
     """
     if not tried:
         return LEAST

@@ -47,11 +47,7 @@ def rank(fit: Fit) -> int:
 
 
 def bic(fits: Mapping[int, Fit]) -> dict[int, float]:
-    """BIC of each candidate; infinite if the fit has no likelihood.
-
-    Args:
-        fits: Fits of the same data, by number of the candidate.
-    """
+    """BIC of each candidate for the same data; infinite if the fit has no likelihood."""
     support = {number: fit.support or Support.unknown(0) for number, fit in fits.items()}
     deviance = {number: float(one.deviance) for number, one in support.items()}
     terms = {number: float(one.terms) for number, one in support.items()}
@@ -78,16 +74,12 @@ def values_of(fit: Fit) -> Float[np.ndarray, " element"]:
 
 
 def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) -> int:
-    """Number of the candidate to choose.
+    """Number of the candidate to choose, by `criterion`, which is to be small: `bic` if not given.
 
     It is the simplest of those whose evidence is largest, up to `MENTION`, among the candidates of
     the best rank; of equally simple ones the first, which is the most usual. A candidate with less
     evidence than a simpler one is not chosen, whatever their ranks: it is no remedy for what the
     simpler one lacks.
-
-    Args:
-        fits: Fits of the same data, by number of the candidate.
-        criterion: What is to be small; `bic` if not given.
     """
     if len(fits) == 1:
         return next(iter(fits))
@@ -129,22 +121,14 @@ def weights(fits: Mapping[int, Fit]) -> dict[int, float]:
 
 
 def with_close(fits: Mapping[int, Fit], chosen: int, share: Mapping[int, float]) -> np.ndarray:
-    """Covariance of the chosen elements, with the differences to other likely circuits.
+    """Covariance of the chosen elements [SI²], with the differences to other likely circuits.
 
     For each element that another candidate has under the same name and unit,
 
         var = Σ_m w_m (σ_m² + (θ_m − θ)²),
 
-    with the weights w_m, and θ of the chosen circuit. Elements that a candidate does not determine
-    are left out.
-
-    Args:
-        fits: Fits of the same data, by number of the candidate.
-        chosen: Number of the chosen circuit.
-        share: Probability of each candidate.
-
-    Returns:
-        Covariance [SI²], (element, element).
+    with the probabilities w_m of the candidates, and θ of the chosen circuit. Elements that a
+    candidate does not determine are left out.
     """
     mine = fits[chosen]
     cov = np.array(mine.cov, float)

@@ -52,10 +52,7 @@ def usual_circuits() -> tuple[AbstractCircuit, ...]:
 def search(count: int, candidates: Sequence[AbstractCircuit], fit: FitRows) -> list[dict[int, Fit]]:
     """Fits of the candidates that each recording asks for, by number of the candidate.
 
-    Args:
-        count: Number of recordings.
-        candidates: Circuits; the search starts at the first one.
-        fit: Fits the candidate of a number to some recordings.
+    `fit` fits the candidate of a number to some of the recordings. The search starts at the first.
     """
     begin, patience = time.monotonic(), PATIENCE * count
     found = [{0: one} for one in fit(0, range(count))]
@@ -74,12 +71,7 @@ def search(count: int, candidates: Sequence[AbstractCircuit], fit: FitRows) -> l
 
 
 def asked(fits: Mapping[int, Fit], candidates: Sequence[AbstractCircuit]) -> list[int]:
-    """Numbers of the candidates to fit next; none if the search ends.
-
-    Args:
-        fits: The fits so far, by number of the candidate.
-        candidates: The circuits by number.
-    """
+    """Numbers of the candidates to fit next, after these fits; none if the search ends."""
     size = [len(circuit.names()) for circuit in candidates]
     left = [number for number in range(len(size)) if number not in fits]
     left.sort(key=lambda number: size[number])  # time may end the search, so simple ones first

@@ -89,13 +89,7 @@ class Selection(Overviewed):
     def of(
         cls, fits: Mapping[int, Fit], chosen: int, circuits: Sequence[AbstractCircuit]
     ) -> "Selection":
-        """The selection from fits of some of the candidates.
-
-        Args:
-            fits: Fits of one recording, by number of the candidate.
-            chosen: Number of the chosen candidate.
-            circuits: All candidates.
-        """
+        """The selection from fits of some of the circuits, by number."""
         left = [number for number in range(len(circuits)) if number not in fits]
         late = set(asked(fits, circuits)) if len(fits) > 1 else set()
         weighed = all(len(circuits[number].names()) < elements(fits[chosen]) for number in left)

@@ -41,11 +41,7 @@ LARGEST = 50.0  # exponent of an evidence; more is as certain
 
 
 def unseen(fit: Fit) -> Float[np.ndarray, "element element"]:
-    """Covariance that a spread adds to that of the elements [SI²]; 0 if it is not known.
-
-    Args:
-        fit: One fit.
-    """
+    """Covariance that a spread adds to that of the elements [SI²]; 0 if it is not known."""
     size, support = elements(fit), fit.support
     if support is None or fit.circuit.exponents():
         return np.zeros((size, size))  # another shape of the spread that it has is no candidate
@@ -59,12 +55,7 @@ def unseen(fit: Fit) -> Float[np.ndarray, "element element"]:
 
 
 def hidden(fits: Mapping[int, Fit], chosen: int) -> dict[int, float]:
-    """Probability of the candidate that is the chosen circuit and R_s; empty if there is none.
-
-    Args:
-        fits: Fits of the same data, by number of the candidate.
-        chosen: Number of the chosen circuit.
-    """
+    """Probability of the candidate that is the chosen circuit and R_s; empty if there is none."""
     own = dict(zip(fits[chosen].circuit.names(), values_of(fits[chosen]), strict=True))
     found = {}
     if "r_p" not in own or SERIES in own:
@@ -82,12 +73,7 @@ def hidden(fits: Mapping[int, Fit], chosen: int) -> dict[int, float]:
 
 
 def posterior(estimate: float, sigma: float) -> tuple[float, float]:
-    """Evidence B for ε against none, and the mean of ε².
-
-    Args:
-        estimate: Estimate of ε.
-        sigma: Its standard error.
-    """
+    """Evidence B for ε against none, from its estimate ± sigma, and the mean of ε²."""
     variance = 1 / (1 / sigma**2 + 1 / WIDTH**2)
     mean, deviation = variance * estimate / sigma**2, math.sqrt(variance)
     u = -mean / deviation

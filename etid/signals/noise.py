@@ -144,18 +144,6 @@ class Measurement(eqx.Module):
     sample_rate: Float[Array, "*lane"]
 
 
-def measure(
-    v_th: Float[Array, " time"],
-    v_out: Float[Array, " time"],
-    resolution_th: Float[Array, ""],
-    resolution_out: Float[Array, ""],
-    sample_rate: Float[Array, ""],
-) -> Measurement:
-    """Both voltages with their estimated noise; `resolution` is the converter's step [V] or 0."""
-    sigma_th, sigma_out = noise(v_th, resolution_th), noise(v_out, resolution_out)
-    return Measurement(v_th, v_out, jnp.asarray(sigma_th), jnp.asarray(sigma_out), sample_rate)
-
-
 def noise(
     v: Float[Array | np.ndarray, " time"], resolution: Float[Array | np.ndarray, ""]
 ) -> Float[Array | np.ndarray, ""]:

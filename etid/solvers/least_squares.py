@@ -72,7 +72,7 @@ def least_squares(
 
 
 def stepped(
-    terms: Terms,
+    terms: Terms | None,
     solver: LevenbergMarquardt,
     start: Float[Array, " parameter"],
     args: Any,
@@ -80,10 +80,12 @@ def stepped(
 ) -> tuple[Float[Array, " parameter"], Any]:
     """The minimum; the number of steps, the verdict, and the normal equations there.
 
-    The arguments are those of `least_squares`; the result has no derivative.
+    The arguments are those of `least_squares`; `terms` is None if the solver has equations of its
+    own. The result has no derivative.
     """
 
     def fn(q: Array, args: Any) -> tuple[Array, None]:
+        assert terms is not None
         return terms(q, args), None
 
     # JAX remembers the trace of this function: its shapes and its use in the loop need only one.

@@ -189,7 +189,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         high_cutoff=0.75, high_constant=5.0, low_constant=0.25
     )
     geodesic: bool = False
-    equations: Callable[[Callable, Array, Any], NormalEquations] = normal_equations
+    equations: Callable[[Any, Array, Any], NormalEquations] = normal_equations
     second_order: Callable[[Callable, Array, Array, Any], Array] = second_order
 
     def init(

@@ -1,12 +1,14 @@
-"""Inverses and roots of symmetric matrices, each scaled to a unit diagonal.
+"""Inverses and roots of symmetric matrices, each scaled to a unit diagonal, and errors from them.
 
-The parameters of a fit have different units, or very different accuracies. Every function here
-therefore scales its matrix M before it is factorised: D⁻¹ M D⁻¹, where D² is the diagonal of M.
+The parameters of a fit have different units, or very different accuracies. Inverses and roots
+therefore scale their matrix M before it is factorised: D⁻¹ M D⁻¹, where D² is the diagonal of M.
 """
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 SMALLEST = 1e-12  # eigenvalue of a scaled matrix; double precision resolves no smaller one
 
@@ -48,6 +50,26 @@ def inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A matrix L with L Lᵀ = M⁻¹, for a positive semidefinite M."""
     factor, scale = _factor(matrix)
     return jax.scipy.linalg.solve_triangular(factor, jnp.diag(1 / scale), lower=True).T
+
+
+def log_stderr(
+    response: Callable[[Float[Array, " parameter"]], Complex[Array, " frequency"]],
+    values: Float[Array, " parameter"],
+    cov: Float[Array, "parameter parameter"],
+) -> Float[Array, "2 frequency"]:
+    """Standard errors of ln |Z| and of the phase [rad], to first order.
+
+    var = J cov Jᵀ,    J = ∂(ln |Z|, arg Z) / ∂parameters
+
+    `response` is the impedance at all frequencies [Ω], `cov` the covariance of the parameters.
+    """
+
+    def parts(p: Float[Array, " parameter"]) -> Float[Array, "2 frequency"]:
+        log_z = jnp.log(response(p))
+        return jnp.stack([log_z.real, log_z.imag])
+
+    slope = jax.jacfwd(parts)(values)
+    return jnp.sqrt(jnp.einsum("cfi,ij,cfj->cf", slope, cov, slope))
 
 
 def _unit_diagonal(

@@ -1,22 +1,40 @@
-"""The fit of one load that was recorded at several amplitudes."""
+"""The fit of one load that was recorded at several amplitudes, and its starts.
+
+To a pulse of the current I, a resistor R / (1 + |i| / I_0) looks like the resistance R_I with
+
+    1 / R_I = 1 / R + I / (R I_0).
+
+The records show R_I for each amplitude. A straight line gives R and I_0, even if R_I is far below R
+in all of them. A linear fit of such a record would not do: it ends anywhere.
+"""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from etid.circuits.current_dependent import current_dependent
 from etid.estimators.amplitudes.last_step import last_step
 from etid.estimators.amplitudes.late import follows_late
-from etid.estimators.amplitudes.starts import likeliest, starts
-from etid.estimators.amplitudes.terms import Amplitudes
+from etid.estimators.amplitudes.terms import STILL, Amplitudes
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
+from etid.estimators.maximum_likelihood.profile import Profile
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fit import complex_rrse
-from etid.signals.harmonics import real_parts
-from etid.signals.transfer import as_complex
+from etid.signals.harmonics import Spectrum, real_parts
+from etid.signals.transfer import as_complex, power
+from etid.solvers.harmonic_balance import to_time
 from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
+
+# Of the other elements, relative to those of the likeliest linear load, which are far too large.
+LEVELS = (1.0, 0.1)
+TIMES = (1.0, 0.1, 0.01, 0.001)
+REACH = 100.0  # I_0 of the lines, relative to the smallest and the largest current
+LINES = 200
 
 
 def _equations(_, q: Float[Array, " q"], of: Amplitudes) -> NormalEquations:
@@ -49,9 +67,9 @@ def fit_amplitudes(of: Amplitudes) -> Estimate:
     ) -> optx.Solution:
         return least_squares(lambda q, of: of(q), solver, start, of, MAX_STEPS)
 
-    alone = likeliest(of)
+    alone = _likeliest(of)
     of = of.weighted(alone)
-    rough = best_start(of, starts(of, alone))
+    rough = best_start(of, _starts(of, alone))
     # First with Z_th fixed: from a distant start, a joint fit would distort Z_th.
     for _ in range(2):
         rough = refined(of, rough, ROUGHLY).value
@@ -84,3 +102,78 @@ def fit_amplitudes(of: Amplitudes) -> Estimate:
         strain=change @ jnp.linalg.solve(of.given.cov, change),
         late=lags,
     )
+
+
+def _likeliest(of: Amplitudes) -> Float[Array, "record own"]:
+    """The likeliest linear load for each record alone, in the order of `Gains`."""
+
+    def one(spectrum: Spectrum) -> Float[Array, " own"]:
+        gain = of.gain(spectrum)
+        starts = of.given.starts(spectrum, of.sample_rate, of.circuit).log_elements
+        each = jax.vmap(lambda logs: LoadUnknowns(logs, jnp.zeros(())).vector())(starts)
+        return best_start(lambda own: Profile.of_output(spectrum, gain(own)[0]).terms[0], each)
+
+    return jax.lax.map(one, of.spectra)
+
+
+def _starts(of: Amplitudes, alone: Float[Array, "record own"]) -> Float[Array, "start q"]:
+    """Starts of a fit of all records, from the likeliest linear load of each of them alone."""
+    logs = LoadUnknowns.of(alone).log_elements
+    if current_dependent(of.circuit.impedance()) is not None:
+        size = jnp.sum(power(of.spectra.x), axis=-1)
+        ends = logs[jnp.stack([jnp.argmin(size), jnp.argmax(size)])]
+        scales = jnp.log(jnp.asarray(list(itertools.product(LEVELS, TIMES))))
+        others = ends[None] + (scales @ of.circuit.scaling())[:, None]
+        resistance, i_0 = _line(*_seen(of, alone))
+        each = others.reshape(-1, of.elements)
+        logs = jax.vmap(lambda one: _moved(of, one, resistance, i_0))(each)
+    return jax.vmap(of.start)(logs if of.prior is None else of.prior.placed(logs))
+
+
+def _seen(
+    of: Amplitudes, alone: Float[Array, "record own"]
+) -> tuple[Float[Array, " record"], Float[Array, " record"]]:
+    """Current [A] and resistance [Ω] of each record: Σ |i|³ / Σ i² and Σ v i / Σ i²."""
+
+    def one(each: tuple[Array, Spectrum]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        own, spectrum = each
+        still = STILL * spectrum.frequency[:1]
+        source = of.source(own, spectrum, jnp.concatenate([still, spectrum.frequency]))
+        y = jnp.pad(spectrum.y, (1, 0))  # of all harmonics, like the source
+        points = 2 * spectrum.frequency.size
+        i = to_time(source.current - source.admittance * y, points)
+        squares = jnp.sum(i**2)
+        found = jnp.sum(jnp.abs(i) ** 3), jnp.sum(i * to_time(y, points))
+        return found[0] / squares, found[1] / squares
+
+    return jax.lax.map(one, (alone, of.spectra))
+
+
+def _line(
+    current: Float[Array, " record"], resistance: Float[Array, " record"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """R and I_0 that give the resistances at these currents best, in relative terms."""
+    levels = jnp.geomspace(jnp.min(current) / REACH, jnp.max(current) * REACH, LINES)
+    small = jnp.maximum(jnp.max(resistance) * jnp.finfo(resistance.dtype).eps, resistance)
+    logs = jnp.log(small)[None] + jnp.log1p(current[None] / levels[:, None])  # of R
+    best = jnp.argmin(jnp.var(logs, axis=1))
+    return jnp.exp(jnp.mean(logs[best])), levels[best]
+
+
+def _element(of: Amplitudes, logs: Float[Array, " element"]) -> Float[Array, "2"]:
+    """Logarithms of R and I_0 of the resistor that depends on its current."""
+    element = current_dependent(of.circuit.with_log_values(logs).impedance())
+    assert element is not None
+    return jnp.log(jnp.stack([jnp.asarray(element.r), jnp.asarray(element.i_0)]))
+
+
+def _moved(
+    of: Amplitudes,
+    logs: Float[Array, " element"],
+    resistance: Float[Array, ""],
+    i_0: Float[Array, ""],
+) -> Float[Array, " element"]:
+    """The elements with the smallest change that gives the resistor this R and I_0."""
+    wanted = jnp.log(jnp.stack([resistance, i_0])) - _element(of, logs)
+    by_logs = jax.jacfwd(lambda logs: _element(of, logs))(logs)
+    return logs + jnp.linalg.pinv(by_logs) @ wanted

@@ -36,11 +36,7 @@ def follows_late(
 ) -> Bool[Array, ""]:
     """Whether a resistance that follows its current late explains the residual.
 
-    Args:
-        of: The records.
-        q: Unknowns at the minimum.
-        slopes: Derivatives of the predictions, times the weights.
-        terms: Terms of the records at the minimum.
+    `slopes` and `terms` are those at the minimum `q`, times the weights.
     """
     if current_dependent(of.circuit.impedance()) is None:
         return jnp.array(False)

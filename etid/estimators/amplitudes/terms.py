@@ -25,7 +25,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import Norton, Port, Signals, current_dependent, port
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.gains import Gains
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.profile import Profile
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
@@ -56,7 +56,7 @@ class Amplitudes(eqx.Module):
         expected: Variances of the terms by the noise; None before the first estimate.
     """
 
-    given: AbstractGiven
+    given: GivenDriver
     feed: HarmonicDriver | MeasuredCurrent
     circuit: AbstractCircuit
     spectra: Spectrum
@@ -131,7 +131,7 @@ class Amplitudes(eqx.Module):
         known, room = spectrum.frequency.size, frequency.size - spectrum.frequency.size - 1
         # Harmonics that are not fitted are a part of the stimulus too.
         x = jnp.pad(spectrum.x, (1, room))
-        if not isinstance(self.given, GivenDriver) or isinstance(self.feed, MeasuredCurrent):
+        if isinstance(self.feed, MeasuredCurrent):
             return Norton(x, jnp.zeros_like(x))
         gain = self.gain(spectrum)
         near = self.given.z_th(gain.w(gain.split(own)[2]))

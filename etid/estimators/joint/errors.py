@@ -17,17 +17,44 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.estimate import Estimate
-from etid.estimators.joint.seen import Seen, seen_at
-from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
-from etid.estimators.sandwich import Curvature
+from etid.estimators.joint.terms import Joint, Loads, in_turn
+from etid.estimators.maximum_likelihood.condensed import means
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.load import changes
+from etid.estimators.sandwich import Curvature, Linear
 from etid.estimators.score_tests import other_circuit
+from etid.estimators.unknowns import LoadUnknowns
+from etid.signals.harmonics import signal_share
+from etid.signals.transfer import as_complex
 from etid.solvers.matrices import inverse
 from etid.solvers.successive import Minimum
 
 _Sums = tuple[Float[Array, "record x common"], Float[Array, "common common"]]
+
+
+class _AtMinimum(NamedTuple):
+    """A load at its minimum; the derivatives are those with respect to (common, own).
+
+    Attributes:
+        chi2: χ² per degree of freedom.
+        rrse: RRSE; with a current that of the record that is predicted worse.
+        terms: Condensed terms of the records.
+        linear: The same, linear in the parameters.
+        changes: Derivatives of the terms with respect to changes of the circuit, to a gain of
+            V_out, and to a gain of the current if there is one.
+        by_scale: Pull of a measured current that is larger by its own size on the parameters; 0
+            without a current.
+    """
+
+    chi2: Float[Array, "*load"]
+    rrse: Float[Array, "*load"]
+    terms: Float[Array, "*load term"]
+    linear: Linear
+    changes: Float[Array, "*load change term"]
+    by_scale: Float[Array, "*load parameter"]
 
 
 class _Eliminated(eqx.Module):
@@ -50,6 +77,18 @@ class _Eliminated(eqx.Module):
     own_pull: Float[Array, " own"]
 
 
+class _ByX(NamedTuple):
+    """Effect of unit noise in the X of a load, which has two numbers at each of its places.
+
+    Attributes:
+        of_common: On the score of `common`.
+        of_own: On the own parameters.
+    """
+
+    of_common: Float[Array, "*load x common"]
+    of_own: Float[Array, "*load x own"]
+
+
 class Delay(eqx.Module):
     """The trigger delay of a load and its error; several can be stacked.
 
@@ -64,55 +103,41 @@ class Delay(eqx.Module):
     slope: Float[Array, "*load common"]
 
 
-class Contradictions(NamedTuple):
-    """What the score tests of a load show; several can be stacked.
-
-    Attributes:
-        other: Another circuit or another gain of V_out.
-        scale: Another scale of the current.
-    """
-
-    other: Bool[Array, "*load"]
-    scale: Bool[Array, "*load"]
-
-
 class Found(NamedTuple):
     """What is found of a load; several can be stacked.
 
     Attributes:
         estimate: The estimate.
-        wrong: What its data contradict.
+        other: Whether the data show another circuit or another gain of V_out.
+        scale: Whether they show another scale of the current.
         delay: Its trigger delay.
         by_scale: Derivatives of the logarithms of the elements with respect to that of a scale of
             all measured currents.
     """
 
     estimate: Estimate
-    wrong: Contradictions
+    other: Bool[Array, "*load"]
+    scale: Bool[Array, "*load"]
     delay: Delay
     by_scale: Float[Array, "*load element"]
 
 
 def estimates(
-    study: DriverStudy,
+    model: Joint,
+    groups: Sequence[Loads],
     common: Float[Array, " common"],
-    fitted: Sequence[tuple[Own, optx.RESULTS]],
+    fitted: Sequence[tuple[LoadUnknowns, optx.RESULTS]],
     several: Sequence[int],
     least: Minimum,
 ) -> tuple[Float[Array, "common common"], list[Found]]:
     """Covariance of `common`, and the estimates of each group with their covariances.
 
-    Args:
-        study: Calibrations and loads.
-        common: Common parameters at the minimum.
-        fitted: Unknowns of the loads of each group, and the results of their solvers.
-        several: Number of unloaded records in each group that several loads share.
-        least: What the search of the minimum tells.
+    `fitted` has the unknowns of the loads of each group and the results of their solvers, `several`
+    the number of unloaded records in each group that several loads share.
     """
-    groups, model = study.groups, study.model
     owns = [own for own, _ in fitted]
     found = [
-        _of_group(study, loads, common, own, several=count > 0)
+        _of_group(model, loads, common, own, several=count > 0)
         for loads, own, count in zip(groups, owns, several, strict=True)
     ]
     of, pull = model.calibrations, jnp.zeros_like(common)
@@ -138,9 +163,9 @@ def estimates(
 
         def one(
             load: Loads,
-            own: Own,
+            own: LoadUnknowns,
             eliminated: _Eliminated,
-            seen: Seen,
+            at: _AtMinimum,
             by_x: _ByX | None,
             result: optx.RESULTS,
             sums_of: Float[Array, "record x common"] = sums_of,
@@ -156,61 +181,93 @@ def estimates(
                 delay_samples=own.vector()[e:],
                 cov=whole[:e, :e],
                 shared_cov=shared[:e, :e],
-                chi2=seen.chi2,
-                rrse=seen.rrse,
+                chi2=at.chi2,
+                rrse=at.rrse,
                 result=optx.RESULTS.where(result == optx.RESULTS.successful, least.result, result),
                 steps=least.points,
                 strain=strain,
             )
             delay = Delay(own.delay_samples, private[e, e], eliminated.slope[e])
-            wrong = _contradictions(seen, load, own, eliminated, bread, total.score)
+            wrong = _contradictions(at, load, own, eliminated, bread, total.score)
             moved = eliminated.own_pull + eliminated.slope @ (bread @ pull)
-            return Found(estimate, wrong, delay, moved[:e])
+            return Found(estimate, *wrong, delay, moved[:e])
 
         judged.append(in_turn(one, loads, own, *each, results))
     return cov, judged
 
 
-class _ByX(NamedTuple):
-    """Effect of unit noise in the X of a load, which has two numbers at each of its places.
-
-    Attributes:
-        of_common: On the score of `common`.
-        of_own: On the own parameters.
-    """
-
-    of_common: Float[Array, "*load x common"]
-    of_own: Float[Array, "*load x own"]
-
-
 def _of_group(
-    study: DriverStudy,
+    model: Joint,
     loads: Loads,
     common: Float[Array, " common"],
-    owns: Own,
+    owns: LoadUnknowns,
     several: bool,
-) -> tuple[_Eliminated, Seen, _ByX | None]:
+) -> tuple[_Eliminated, _AtMinimum, _ByX | None]:
     """Each load of a group at its minimum, evaluated once."""
-    driver = study.model.around(common, loads.frequency[0])
+    driver = model.around(common, loads.frequency[0])
 
-    def one(load: Loads, own: Own) -> tuple[_Eliminated, Seen, _ByX | None]:
-        seen, by_x = seen_at(study, driver, load, own)
-        eliminated = _eliminated(seen, common.size)
-        return eliminated, seen, _influence(by_x, eliminated) if several else None
+    def one(load: Loads, own: LoadUnknowns) -> tuple[_Eliminated, _AtMinimum, _ByX | None]:
+        at, by_x = _at_minimum(model, driver, load, own)
+        eliminated = _eliminated(at, common.size)
+        return eliminated, at, _influence(by_x, eliminated) if several else None
 
     return in_turn(one, loads, owns)
 
 
+def _at_minimum(
+    model: Joint, driver: GivenDriver, load: Loads, own: LoadUnknowns
+) -> tuple[_AtMinimum, Float[Array, "x parameter"]]:
+    """A load at its minimum, and the effect of unit noise in its X on the gradient.
+
+    The noise has two numbers at each knot. A caller that does not use its effect does not compute
+    it.
+    """
+    lane, q = load.behind(driver, model), jnp.concatenate([own.vector(), driver.mean])
+    near, records, owned = lane.near(q), lane.known(q), lane.gains.owned
+    profile, condensed = near.profile, near.condensed
+    noise = profile.excess(records)
+    share = jnp.broadcast_to(signal_share(profile.x, records.variance_x), noise.shape)
+    weights = means([profile], lane.knots, jnp.stack([share, noise]))
+    priors = jnp.eye(q.size, owned, owned - q.size) / lane.gains.widths(q[:owned])[None]
+    jacobian = jnp.concatenate([near.jacobian[owned:], near.jacobian[:owned]])
+    linear = Linear(jacobian, *weights, priors=priors)
+    rows = condensed.rows(changes(lane, near))
+    at = _AtMinimum(
+        chi2=2 * profile.objective / (lane.terms - owned),
+        rrse=profile.rrse(records, load.spectrum.x),
+        terms=condensed.part,
+        linear=linear,
+        changes=rows,
+        by_scale=linear.told(rows[-1:])[0] if lane.gains.outputs > 1 else jnp.zeros_like(q),
+    )
+    brought = profile.whitened(profile.gains * as_complex(jnp.sqrt(records.variance_x))[None, :])
+    brought = brought * as_complex(1 / jnp.sqrt(profile.expected))
+    return at, _by_noise(linear, lane.knots.at(brought))
+
+
+def _by_noise(linear: Linear, gains: Complex[Array, "output x"]) -> Float[Array, "both parameter"]:
+    """Effect of unit noise on the gradient, if `gains` bring it into the terms of each output."""
+    outputs, size = gains.shape
+    jacobian = linear.jacobian.reshape(-1, 2, outputs, size)
+    real, imaginary = jacobian[:, 0], jacobian[:, 1]
+    re, im = gains.real[None], gains.imag[None]
+    both = re * real + im * imaginary, re * imaginary - im * real
+    return jnp.concatenate([of.sum(1).T for of in both])
+
+
 def _contradictions(
-    seen: Seen,
+    at: _AtMinimum,
     load: Loads,
-    own: Own,
+    own: LoadUnknowns,
     eliminated: _Eliminated,
     bread: Float[Array, "common common"],
     score: Float[Array, "common common"],
-) -> Contradictions:
-    """Score tests of one load; `bread` and `score` are those of `common` from all terms."""
-    slope, linear = eliminated.slope, seen.linear
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether a load shows another circuit or gain, and another scale of the current.
+
+    `bread` and `score` are those of `common` from all terms.
+    """
+    slope, linear = eliminated.slope, at.linear
     covariance = jnp.block(
         [
             [bread, bread @ slope.T],
@@ -219,12 +276,12 @@ def _contradictions(
     )
     spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
     found = other_circuit.scores(
-        seen.changes,
+        at.changes,
         linear,
-        seen.terms,
+        at.terms,
         # At the minimum the other terms have the opposite gradient.
-        -linear.jacobian @ seen.terms,
-        spread.set(score - eliminated.rest.score),
+        -linear.jacobian @ at.terms,
+        spread.set(score - eliminated.rest.score) + linear.precision,
         covariance,
         slice(bread.shape[0], bread.shape[0] + own.log_elements.size),
     )
@@ -236,17 +293,17 @@ def _contradictions(
         scale = of_current.contradicts()
     other = other_circuit.Scores.of(found, gain=True)
     # A load that takes no part has its own verdict.
-    return Contradictions((other.seen() | other.has_other_gain()) & load.used, scale & load.used)
+    return (other.seen() | other.has_other_gain()) & load.used, scale & load.used
 
 
-def _eliminated(seen: Seen, c: int) -> _Eliminated:
+def _eliminated(at: _AtMinimum, c: int) -> _Eliminated:
     """A load whose own parameters are eliminated; they follow the `c` common ones."""
-    of = seen.linear.curvature()
+    of = at.linear.curvature()
     bread = inverse(of.expected[c:, c:])
     slope = -bread @ of.expected[c:, :c]
     cov = bread @ of.score[c:, c:] @ bread
-    pull = seen.by_scale[:c] + slope.T @ seen.by_scale[c:]
-    return _Eliminated(of.eliminate(c), cov, slope, bread, pull, bread @ seen.by_scale[c:])
+    pull = at.by_scale[:c] + slope.T @ at.by_scale[c:]
+    return _Eliminated(of.eliminate(c), cov, slope, bread, pull, bread @ at.by_scale[c:])
 
 
 # --- Loads with one unloaded record --------------------------------------------------------------

@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float
 
 from etid.estimators.joint.errors import Found, estimates
 from etid.estimators.joint.near import minimum
-from etid.estimators.joint.terms import Current, DriverStudy, Joint, Loads, Own, in_turn
+from etid.estimators.joint.terms import Current, Joint, Loads, in_turn
 from etid.estimators.maximum_likelihood import search
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
+from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
 
 
@@ -36,30 +36,28 @@ def fit_together(
 
     Returns:
         Common parameters, their covariance, and what is found of the loads of each group, stacked.
-        In the estimates, `shared_cov` is the
-        part that several loads share: from the uncertainty of `common`, and from the noise of
+        `shared_cov` of an estimate comes from the uncertainty of `common`, and from the noise of
         shared unloaded records.
     """
-    study = DriverStudy(model, groups)
-    common, parts, least = minimum(study)
+    common, parts, least = minimum(model, groups)
     # The loads that take no part are fitted now, with the final Z_th.
-    refitted = [_refitted(study, common, *group) for group in zip(groups, parts, strict=True)]
-    cov, found = estimates(study, common, refitted, several, least)
+    refitted = [_refitted(model, common, *group) for group in zip(groups, parts, strict=True)]
+    cov, found = estimates(model, groups, common, refitted, several, least)
     return common, cov, found
 
 
 def _refitted(
-    study: DriverStudy,
+    model: Joint,
     common: Float[Array, " common"],
     loads: Loads,
     starts: Float[Array, "load own"],
-) -> tuple[Own, optx.RESULTS]:
+) -> tuple[LoadUnknowns, optx.RESULTS]:
     """Unknowns of each load at its minimum with this Z_th, and the results of the solver."""
-    driver = study.model.around(common, loads.frequency[0], slopes=False)
+    driver = model.around(common, loads.frequency[0], slopes=False)
 
-    def one(load: Loads, start: Float[Array, " own"]) -> tuple[Own, optx.RESULTS]:
-        q, least = search.minimum(study.lane(driver, load), start)
-        return type(load.own).of(q), least.result
+    def one(load: Loads, start: Float[Array, " own"]) -> tuple[LoadUnknowns, optx.RESULTS]:
+        q, least = search.minimum(load.behind(driver, model), start)
+        return LoadUnknowns.of(q, load.current is not None), least.result
 
     return in_turn(one, loads, starts)
 
@@ -71,19 +69,11 @@ def fit_alone(
     sample_rate: Float[Array, ""],
     candidates: LoadUnknowns,
     current: Current | None = None,
-) -> tuple[Own, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
-    """Identify the load of one recording; Z_th is fixed.
+) -> tuple[LoadUnknowns, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
+    """Identify the load of one recording from the best of several starts; Z_th is fixed.
 
     With a current Z_th is not fixed: the three records may know it better than the calibrations,
     whose error would be a misfit.
-
-    Args:
-        model: Structure of the circuit and its prior.
-        driver: The driver at the harmonics of the recording, with z only if there is a current.
-        spectrum: The recording.
-        sample_rate: Its sampling rate [Hz].
-        candidates: Starts, stacked; the start that predicts best is refined.
-        current: Harmonics of the measured current [A], and their variances [A²].
 
     Returns:
         The unknowns, the result of the solver, χ² per degree of freedom, RRSE, and whether mains
@@ -92,8 +82,8 @@ def fit_alone(
     lane = model.lane(driver, spectrum, sample_rate, current)
     start = search.best_start(lane, candidates)
     q, least = search.minimum(lane, jnp.concatenate([start, driver.mean]))
-    kind = LoadUnknowns if current is None else LoadWithCurrentUnknowns
     records, profile = lane.known(q), least.near.profile
     chi2 = 2 * least.objective / (lane.terms - start.size)
     error, hum = profile.rrse(records, spectrum.x), profile.shows_hum(records)
-    return kind.of(q[: start.size]), least.result, chi2, error, hum
+    own = LoadUnknowns.of(q[: start.size], current is not None)
+    return own, least.result, chi2, error, hum

@@ -25,11 +25,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.estimate import MAX_STEPS, SOLVER
-from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
+from etid.estimators.joint.terms import Joint, Loads, in_turn
 from etid.estimators.maximum_likelihood.calibrations import DENSE, Calibrations
 from etid.estimators.maximum_likelihood.condensed import apart
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.profile import total
 from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers import successive
@@ -84,16 +83,16 @@ class _Signals(eqx.Module):
     of_x: list[bool] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, study: DriverStudy) -> "_Signals":
+    def of(cls, model: Joint, groups: list[Loads]) -> "_Signals":
         """The signals of a study."""
-        sizes = [loads.spectrum.x.shape[-1] for loads in study.groups]
+        sizes = [loads.spectrum.x.shape[-1] for loads in groups]
         return cls(
-            study.model.calibrations,
+            model.calibrations,
             [
                 knots(size, DENSE).at(loads.frequency[0])
-                for size, loads in zip(sizes, study.groups, strict=True)
+                for size, loads in zip(sizes, groups, strict=True)
             ],
-            [study.model.shares(size) for size in sizes],
+            [model.shares(size) for size in sizes],
         )
 
     def _of_each(self, known: Array, of_w: list[Array], axis: int) -> list[Array]:
@@ -118,7 +117,7 @@ class _Signals(eqx.Module):
     def slopes(self, common: Float[Array, " common"]) -> list[Float[Array, "common signal knot"]]:
         """Derivatives of the signals."""
         source = self.calibrations.source_of(common)
-        known = self.calibrations.slopes(common, self.calibrations.knots).by_common
+        known = self.calibrations.slopes(common, self.calibrations.knots).by_unknown
         of_w = []
         for f in self.frequency:
             rows = source.slopes(f) * reciprocal(self._loaded(common, f))[None, :]
@@ -198,7 +197,7 @@ def _of_calibrations(calibrations: Calibrations, common: Float[Array, " common"]
     part = near.condensed.part.reshape(-1, size)
     pull = jnp.einsum("stk,tk->sk", rows, part)
     curvature = jnp.einsum("stk,utk->suk", rows, rows)
-    objective = total([of.objective for of in near.profiles])
+    objective = near.objective
     none = jnp.zeros((0, 2 * records, size))
     return _Part(objective, pull, curvature, none, jnp.zeros(0))
 
@@ -225,7 +224,7 @@ def _by_signals(driver: GivenDriver, shared: bool) -> GivenDriver:
 
 
 def _of_group(
-    study: DriverStudy,
+    model: Joint,
     common: Float[Array, " common"],
     loads: Loads,
     owns: Float[Array, "load own"],
@@ -233,11 +232,11 @@ def _of_group(
     """A group of loads as a function of the signals, and L of each load."""
     size = loads.spectrum.x.shape[-1]
     every = knots(size, DENSE)
-    driver = study.model.around(common, loads.frequency[0], slopes=False)
-    driver = _by_signals(driver, study.model.shares(size))
+    driver = model.around(common, loads.frequency[0], slopes=False)
+    driver = _by_signals(driver, model.shares(size))
 
     def one(load: Loads, own: Float[Array, " own"]) -> tuple[_Part, Float[Array, "own own"]]:
-        lane, o = study.lane(driver, load), own.size
+        lane, o = load.behind(driver, model), own.size
         q = jnp.concatenate([own, driver.mean])
         prior, rest = 1 / lane.gains.widths(own), lane.rest(own)
         near = lane.near(q, every)
@@ -253,7 +252,7 @@ def _of_group(
             of_x = apart(lambda _: lane.by_x(near), q)
             pull = jnp.concatenate([pull[:W], every.summed(of_x[W:])])
         found = _Part(
-            objective=near.profile.objective + 0.5 * jnp.dot(rest, rest),
+            objective=near.objective + 0.5 * jnp.dot(rest, rest),
             pull=pull,
             curvature=curvature,
             following=following,
@@ -269,17 +268,17 @@ def _of_group(
 
 
 def minimum(
-    study: DriverStudy,
+    model: Joint, groups: list[Loads]
 ) -> tuple[Float[Array, " common"], list[Array], successive.Minimum]:
     """The minimum of a study; it has no derivative.
 
     Returns:
         The common parameters, the unknowns of the loads of each group, and what else is known.
     """
-    signals = _Signals.of(study)
+    signals = _Signals.of(model, groups)
     # The sum of squares grows with the number of loads; a detectable change of it does not.
-    terms = sum(loads.terms for loads in study.groups)
-    count = sum(loads.used.size for loads in study.groups)
+    terms = sum(loads.terms for loads in groups)
+    count = sum(loads.used.size for loads in groups)
     solver = LevenbergMarquardt(
         rtol=WITHIN / math.sqrt(terms),
         ftol=SOLVER.ftol / (1 + count),
@@ -288,16 +287,16 @@ def minimum(
         second_order=_second_order,
     )
 
-    owns = [loads.own.vector() for loads in study.groups]
-    start, named = ravel_pytree((study.model.calibrations.start(), owns))
+    owns = [loads.own.vector() for loads in groups]
+    start, named = ravel_pytree((model.calibrations.start(), owns))
 
     def approximate(y: Float[Array, " parameter"]) -> tuple[_Near, Float[Array, ""]]:
         common, owns = named(y)
-        pairs = zip(study.groups, owns, strict=True)
-        groups = [_of_group(study, common, *pair) for pair in pairs]
-        known = _of_calibrations(study.model.calibrations, common)
-        parts, roots = [known, *(part for part, _ in groups)], [root for _, root in groups]
-        weak, _ = study.model.calibrations.weak(common)
+        pairs = zip(groups, owns, strict=True)
+        each = [_of_group(model, common, *pair) for pair in pairs]
+        known = _of_calibrations(model.calibrations, common)
+        parts, roots = [known, *(part for part, _ in each)], [root for _, root in each]
+        weak, _ = model.calibrations.weak(common)
         value = 0.5 * jnp.dot(weak, weak) + sum(part.objective for part in parts)
         return _Near(parts, roots, signals(common)), value
 
@@ -306,7 +305,7 @@ def minimum(
     ) -> tuple[Float[Array, " parameter"], Float[Array, ""]]:
         common, owns = named(y)
         common, (_, result, found) = stepped(
-            lambda y, _: y,  # not evaluated: the solver takes the equations
+            None,
             solver,
             common,
             (signals, near),

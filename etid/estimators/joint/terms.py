@@ -20,13 +20,12 @@ from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
-from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
+from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step
 
 Current = tuple[Complex[Array, "*load harmonic"], Float[Array, "*load harmonic"]]
-Own = LoadUnknowns | LoadWithCurrentUnknowns
 
 
 class Joint(eqx.Module):
@@ -88,7 +87,7 @@ class Loads(eqx.Module):
 
     spectrum: Spectrum
     sample_rate: Float[Array, "*load"]
-    own: Own
+    own: LoadUnknowns
     used: Bool[Array, "*load"]
     unloaded: Int[Array, "*load"]
     current: Current | None = None
@@ -103,21 +102,9 @@ class Loads(eqx.Module):
         """Number of terms of all recordings."""
         return 2 * self.spectrum.x.size
 
-
-class DriverStudy(eqx.Module):
-    """All data of the fit of a driver and its loads.
-
-    Attributes:
-        model: Calibrations and structure of the loads.
-        groups: The loads, one group for each length.
-    """
-
-    model: Joint
-    groups: list[Loads]
-
-    def lane(self, driver: GivenDriver, load: Loads) -> Load:
-        """One load behind this driver."""
-        return self.model.lane(driver, load.spectrum, load.sample_rate, load.current)
+    def behind(self, driver: GivenDriver, model: Joint) -> Load:
+        """One of the loads behind this driver."""
+        return model.lane(driver, self.spectrum, self.sample_rate, self.current)
 
 
 def in_turn(one: Callable, *lanes: Any) -> Any:

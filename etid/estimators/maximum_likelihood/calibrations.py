@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.estimate import DELAY_WIDTH, Prior, prior
-from etid.estimators.maximum_likelihood.condensed import Condensed, apart, means
+from etid.estimators.maximum_likelihood.condensed import Condensed, Near, Slopes, apart, means
 from etid.estimators.maximum_likelihood.profile import Profile, Records, excess, total
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
@@ -23,55 +23,6 @@ from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
 
 DENSE = 32  # density of the knots: the floor of the driver's valley is flat
-
-
-class GainSlopes(eqx.Module):
-    """The gains of calibrations and their derivatives at each frequency.
-
-    Attributes:
-        z_th: Z_th [Ω].
-        gains: The gains.
-        by_z: Derivatives with respect to Z_th.
-        by_common: Derivatives with respect to the common parameters.
-    """
-
-    z_th: Complex[Array, "record frequency"]
-    gains: Complex[Array, "record frequency"]
-    by_z: Complex[Array, "record frequency"]
-    by_common: Complex[Array, "common record frequency"]
-
-
-class NearCalibrations(eqx.Module):
-    """Calibrations near some common parameters; terms of the weak priors follow those of records.
-
-    Attributes:
-        profiles: The likelihood of each unloaded record and its outputs at all harmonics.
-        condensed: The same of all records at the knots.
-        slopes: The gains and their derivatives at the knots.
-        jacobian: Transposed Jacobian of all terms.
-        terms: All terms.
-    """
-
-    profiles: list[Profile]
-    condensed: Condensed
-    slopes: GainSlopes
-    jacobian: Float[Array, "common term"]
-    terms: Float[Array, " term"]
-
-    def rows(self, changes: Complex[Array, "row record knot"]) -> Float[Array, "row term"]:
-        """Changes of all terms by changes of the gains."""
-        return self.padded(self.condensed.rows(changes), 0.0)
-
-    def padded(self, rows: Float[Array, "row part"], fill: float) -> Float[Array, "row term"]:
-        """Rows of the terms of the records, followed by a number for each term of the priors."""
-        room = self.terms.size - rows.shape[1]
-        return jnp.pad(rows, ((0, 0), (0, room)), constant_values=fill)
-
-    @property
-    def objective(self) -> Float[Array, ""]:
-        """½ Σ r² of all terms, at all harmonics."""
-        priors = self.terms[self.condensed.part.size :]
-        return total([of.objective for of in self.profiles]) + 0.5 * jnp.dot(priors, priors)
 
 
 class Calibrations(eqx.Module):
@@ -160,7 +111,7 @@ class Calibrations(eqx.Module):
         gains = jax.vmap(delayed, (0, 0, 0, None))(resistance * loop, f, late, self.rate)
         return z_th, gains, -gains * loop
 
-    def slopes(self, common: Float[Array, " common"], every: Knots | None = None) -> GainSlopes:
+    def slopes(self, common: Float[Array, " common"], every: Knots | None = None) -> Slopes:
         """The gains and their derivatives, at all harmonics or at knots."""
         f = self.spectra.frequency if every is None else every.at(self.spectra.frequency)
         z_th, gains, by_z = self._gains(common, every)
@@ -168,34 +119,32 @@ class Calibrations(eqx.Module):
         by_delay = -gains * frequency_variable(f / self.rate)
         alone = as_complex(jnp.eye(f.shape[0]))[:, :, None]
         rows = [by_source * by_z[None], alone * by_delay[None]]
-        return GainSlopes(z_th, gains, by_z, jnp.concatenate(rows))
+        return Slopes(z_th, gains, by_z, jnp.concatenate(rows))
 
     @jax.jit  # JAX remembers its trace
-    def near(self, common: Float[Array, " common"]) -> NearCalibrations:
+    def near(self, common: Float[Array, " common"]) -> Near:
         """The calibrations near these common parameters."""
         profiles = apart(lambda c: self.profiles(self.gains(c)), common)
         condensed = apart(lambda _: Condensed.of(profiles, self.knots), common)
-        slopes = apart(lambda c: self.slopes(c, self.knots), common)
-        rows = condensed.rows(slopes.by_common)
-        terms, jacobian = self.with_weak(common, condensed.part, rows)
-        return NearCalibrations(profiles, condensed, slopes, jacobian, terms)
+        return Near(
+            common, profiles, condensed, apart(lambda c: self.slopes(c, self.knots), common)
+        )
 
-    def with_weak(
-        self,
-        common: Float[Array, " common"],
-        part: Float[Array, " part"],
-        rows: Float[Array, "common part"],
-    ) -> tuple[Float[Array, " term"], Float[Array, "common term"]]:
-        """Terms and their derivatives, followed by those of the weak priors."""
-        weak, by_common = self.weak(common)
-        return jnp.concatenate([part, weak]), jnp.concatenate([rows, by_common], axis=1)
-
-    def linear(self, near: NearCalibrations) -> Linear:
-        """All terms, linear in the common parameters."""
+    def linear(self, near: Near) -> Linear:
+        """The condensed terms, linear in the common parameters."""
         share = total([jnp.where(of.weight > 0, of.share[None, :], 0.0) for of in near.profiles])
         noise = self.noise(total([of.terms for of in near.profiles]))
         found = means(near.profiles, self.knots, jnp.stack([share, noise]))
-        return Linear(near.jacobian, *near.padded(found, 1.0))
+        return Linear(near.jacobian, *found, priors=self.weak(near.q)[1])
+
+    def gradient(self, near: Near, linear: Linear) -> Float[Array, " common"]:
+        """Gradient of the condensed terms and of the weak priors."""
+        return linear.jacobian @ near.condensed.part + self.rest(near.q)
+
+    def rest(self, common: Float[Array, " common"]) -> Float[Array, " common"]:
+        """Gradient of the weak priors."""
+        terms, rows = self.weak(common)
+        return rows @ terms
 
     @jax.jit  # JAX remembers its trace
     def weak(

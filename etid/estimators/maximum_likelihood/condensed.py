@@ -27,6 +27,22 @@ from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex
 
 
+class Slopes(eqx.Module):
+    """Gains and their derivatives at each frequency.
+
+    Attributes:
+        z: The impedance that acts on them [Ω]: Z_L of a load, Z_th of each calibration.
+        gains: The gains.
+        by_z: Derivatives with respect to this impedance.
+        by_unknown: Derivatives with respect to the unknowns of a fit.
+    """
+
+    z: Complex[Array, "*output frequency"]
+    gains: Complex[Array, "output frequency"]
+    by_z: Complex[Array, "output frequency"]
+    by_unknown: Complex[Array, "q output frequency"]
+
+
 class Condensed(eqx.Module):
     """A likelihood as a function of the gains at the knots.
 
@@ -75,6 +91,49 @@ class Condensed(eqx.Module):
     def part(self) -> Float[Array, " part"]:
         """The terms at G₀."""
         return real_parts(self.target.reshape(-1))
+
+
+class Near(eqx.Module):
+    """A likelihood near the unknowns q₀.
+
+    Attributes:
+        q: q₀.
+        profiles: The likelihood of each input and its outputs at all harmonics.
+        condensed: The same of all of them at the knots.
+        slopes: The gains and their derivatives at the knots.
+        by_x: Relative derivatives of X with respect to z at the knots; None if X does not depend
+            on z.
+    """
+
+    q: Float[Array, " q"]
+    profiles: list[Profile]
+    condensed: Condensed
+    slopes: Slopes
+    by_x: Complex[Array, "z knot"] | None = None
+
+    @property
+    def profile(self) -> Profile:
+        """The likelihood of the only input."""
+        (profile,) = self.profiles
+        return profile
+
+    @property
+    def objective(self) -> Float[Array, ""]:
+        """½ Σ r² of the records, at all harmonics."""
+        return total([of.objective for of in self.profiles])
+
+    def by_unknown(self, slopes: Slopes) -> Complex[Array, "q output knot"]:
+        """Derivatives of G X/X̂ with respect to the unknowns."""
+        found = slopes.by_unknown
+        if self.by_x is not None:
+            z = self.by_x[:, None] * slopes.gains[None]
+            found = found.at[found.shape[0] - z.shape[0] :].add(z)
+        return found[: self.q.size]
+
+    @property
+    def jacobian(self) -> Float[Array, "q part"]:
+        """Transposed Jacobian of the condensed terms."""
+        return self.condensed.rows(self.by_unknown(self.slopes))
 
 
 def means(

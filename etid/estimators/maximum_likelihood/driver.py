@@ -19,8 +19,8 @@ from etid.estimators.estimate import (
     Estimate,
     delay_std,
 )
-from etid.estimators.maximum_likelihood.calibrations import Calibrations, NearCalibrations
-from etid.estimators.maximum_likelihood.condensed import Condensed, apart
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.condensed import Condensed, Near, apart
 from etid.estimators.maximum_likelihood.profile import Profile, Records, total
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
@@ -46,7 +46,7 @@ def _equations_of_terms(_: Any, q: Float[Array, " common"], model: Calibrations)
 
     # A term depends on the gains at its own harmonic only.
     terms, by_gain = apart(of_gains, q)
-    by_common, rows = apart(lambda q: model.slopes(q).by_common, q), []
+    by_common, rows = apart(lambda q: model.slopes(q).by_unknown, q), []
     by_gain = by_gain.reshape(*by_gain.shape[:2], -1, by_common.shape[-1])
     for slope, (real, imaginary) in zip(jnp.moveaxis(by_common, 1, 0), by_gain, strict=True):
         rows.append(slope.real[:, None] * real[None] + slope.imag[:, None] * imaginary[None])
@@ -62,9 +62,9 @@ def _equations_at_knots(
     """Normal equations of the condensed terms."""
     model, condensed = of
     slopes = apart(lambda q: model.slopes(q, model.knots), q)
-    terms, rows = model.with_weak(
-        q, condensed.terms(slopes.gains), condensed.rows(slopes.by_common)
-    )
+    weak, by_weak = model.weak(q)
+    terms = jnp.concatenate([condensed.terms(slopes.gains), weak])
+    rows = jnp.concatenate([condensed.rows(slopes.by_unknown), by_weak], axis=1)
     return NormalEquations.of(terms, rows)
 
 
@@ -93,15 +93,16 @@ def _search(
 ) -> tuple[Float[Array, " common"], successive.Minimum]:
     """The minimum, without a derivative."""
 
-    def approximate(q: Float[Array, " common"]) -> tuple[NearCalibrations, Float[Array, ""]]:
-        near = model.near(q)
-        return near, near.objective
+    def approximate(q: Float[Array, " common"]) -> tuple[Near, Float[Array, ""]]:
+        near, (weak, _) = model.near(q), model.weak(q)
+        return near, near.objective + 0.5 * jnp.dot(weak, weak)
 
     def follow(
-        q: Float[Array, " common"], near: NearCalibrations, _: Float[Array, ""]
+        q: Float[Array, " common"], near: Near, _: Float[Array, ""]
     ) -> tuple[Float[Array, " common"], Float[Array, ""]]:
-        before, of = 0.5 * jnp.dot(near.terms, near.terms), (model, near.condensed)
-        q, (_, result, found) = least_squares.stepped(lambda q, _: q, WELL, q, of, MAX_STEPS)
+        part, of = jnp.concatenate([near.condensed.part, model.weak(q)[0]]), (model, near.condensed)
+        before = 0.5 * jnp.dot(part, part)
+        q, (_, result, found) = least_squares.stepped(None, WELL, q, of, MAX_STEPS)
         return q, successive.promised(before - found.objective, result)
 
     terms = 2 * jnp.sum(model.spectra.selected, dtype=start.dtype)
@@ -133,15 +134,7 @@ def rough_source(
     sample_rate: Float[Array, ""],
     start: SourceImpedance,
 ) -> Rough:
-    """Identify Z_th from bands of harmonics.
-
-    Args:
-        spectra: Harmonics of the records, stacked along a leading axis.
-        bands: Their bands.
-        r_load: Resistor of each record [Ω].
-        sample_rate: Sampling rate [Hz].
-        start: Initial Z_th; its structure is the order.
-    """
+    """Identify Z_th from bands of the harmonics; the structure of `start` is the order."""
     calibration = Calibration(r_load, jnp.zeros(r_load.shape), delay_std(r_load))
     model = Calibrations(start, calibration, bands, sample_rate)
     solution = least_squares.least_squares(_terms, ROUGHLY, model.start(), model, ROUGH_STEPS)
@@ -181,15 +174,10 @@ def fit_source(
     r_load: Float[Array, " record"],
     sample_rate: Float[Array, ""],
     candidates: Rough,
-) -> tuple[Calibrations, Estimate, NearCalibrations, Linear]:
-    """Identify Z_th from one or several records with known resistors.
+) -> tuple[Calibrations, Estimate, Near, Linear]:
+    """Identify Z_th from one or several records with known resistors, stacked.
 
-    Args:
-        spectra: Harmonics of the records, stacked along a leading axis.
-        r_load: Resistor of each record [Ω].
-        sample_rate: Sampling rate [Hz].
-        candidates: Starts, stacked, the best first. The others are tried only if it does not
-            converge.
+    The best start is the first; the others are tried only if it does not converge.
 
     Returns:
         The calibrations with Z_th and their delays; the estimate, with parameters in the order of

@@ -19,14 +19,13 @@ from etid.estimators.estimator import (
 from etid.estimators.judgement import STRAINED
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood import given_driver, load_fit
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent, GivenDriver
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.refined_driver import from_harmonics
-from etid.estimators.score_tests import missing_pole
 from etid.estimators.score_tests.falling_resistance import NO_FALL
+from etid.estimators.score_tests.of_calibrations import MISSING_POLE
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
-from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
@@ -57,7 +56,7 @@ def description(words: str, estimated: str, unknowns: str, tests: tuple[str, ...
         of_driver=(
             "it has to be passive",
             "its calibrations must not show one more section of Z_th (score test, χ² of at most "
-            f"{missing_pole.SEEN:g} with two degrees of freedom)",
+            f"{MISSING_POLE:g} with two degrees of freedom)",
         ),
         errors=BY_RESIDUALS,
         refined=True,
@@ -110,28 +109,28 @@ class MaximumLikelihood(AbstractEstimator):
         driver: HarmonicDriver | MeasuredCurrent,
         frequency: Float[Array, " harmonic"],
         shared: bool,
-    ) -> AbstractGiven:
+    ) -> GivenDriver:
         """The distribution of Z_th at the harmonics, given the calibrations; or the current."""
         if isinstance(driver, MeasuredCurrent):
-            return GivenCurrent.at(frequency)
+            return GivenDriver.measured(frequency)
         return given_driver.given(driver, frequency, shared)
 
     def fit_load(
         self,
         lane: Harmonics,
         driver: HarmonicDriver | MeasuredCurrent,
-        known: AbstractGiven,
+        known: GivenDriver,
         circuit: AbstractCircuit,
     ) -> Fit:
         """Refine from the best of several starts, jointly with the uncertain part of the driver."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
         records = Records.of(spectrum)
-        if isinstance(lane, HarmonicsWithCurrent) and isinstance(known, GivenDriver):
+        if isinstance(lane, HarmonicsWithCurrent) and not known.by_current:
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
             records = Records.of(spectrum, current)
             by_current = dataclasses.replace(spectrum, x=current[0], variance_x=current[1])
-            starts = GivenCurrent.at(known.frequency).starts(by_current, rate, circuit)
+            starts = GivenDriver.measured(known.frequency).starts(by_current, rate, circuit)
         else:
             starts = known.starts(spectrum, rate, circuit)
         load = Load.behind(known, circuit, records, rate, prior)
@@ -151,24 +150,3 @@ class MaximumLikelihood(AbstractEstimator):
             f"{stated_limits(self.bounds)}",
             (NO_OTHER_CIRCUIT, NO_OTHER_GAIN, NO_FALL),
         )
-
-
-@dataclasses.dataclass(frozen=True)
-class AbstractByMaximumLikelihood(AbstractEstimator):
-    """An estimator of loads behind drivers of maximum likelihood, which keep their harmonics."""
-
-    def fit_driver(
-        self,
-        records: Harmonics,
-        r_load: Float[Array, " record"],
-        order: int,
-    ) -> Driver:
-        """Identify a driver by maximum likelihood."""
-        return MaximumLikelihood().fit_driver(records, r_load, order)
-
-    def known(
-        self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool
-    ) -> UnloadedShape | None:
-        """The unloaded voltage of the calibrations, if it can be compared."""
-        del shared
-        return shape_of(driver, frequency)

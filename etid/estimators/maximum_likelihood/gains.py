@@ -4,6 +4,10 @@ Another kind of data is another class of outputs, which may be anywhere: `Load.b
 
 All parameters act on a frequency through Z_L, the phase factors of the delays, and W. The code
 computes the derivatives with respect to these and applies the chain rule.
+
+A gain g, a crosstalk κ and a capacitance C of the instrument change the outputs of a load,
+
+    V_out / V_th = (1 + g) Z' / (Z' + Z_th) + κ,      Z' = Z_L ‖ C.
 """
 
 import abc
@@ -19,10 +23,10 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.faults import disturbed, seen_through
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
+from etid.estimators.maximum_likelihood.condensed import Slopes
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.signals.knots import Knots
-from etid.signals.transfer import as_complex, combined, delayed, frequency_variable
+from etid.signals.transfer import as_complex, combined, delayed, frequency_variable, reciprocal
 
 Current = Callable[[Complex[Array, " frequency"]], Complex[Array, " frequency"]]
 """Current per input of all that is connected to the source, from its impedance [Ω]."""
@@ -70,22 +74,6 @@ class VoltageAndCurrent(AbstractOutputs):
         return jnp.stack([z_load * i, i])
 
 
-class Slopes(eqx.Module):
-    """The gains and their derivatives at each frequency.
-
-    Attributes:
-        load: Z_L.
-        gains: The gains.
-        by_load: Derivatives with respect to Z_L.
-        by_unknown: Derivatives with respect to the parameters and z.
-    """
-
-    load: Complex[Array, " frequency"]
-    gains: Complex[Array, "output frequency"]
-    by_load: Complex[Array, "output frequency"]
-    by_unknown: Complex[Array, "q output frequency"]
-
-
 class Gains(eqx.Module):
     """The gains of a load, as functions of the parameters of a fit.
 
@@ -102,7 +90,7 @@ class Gains(eqx.Module):
         measured: The outputs.
     """
 
-    driver: AbstractGiven
+    driver: GivenDriver
     circuit: AbstractCircuit
     frequency: Float[Array, " frequency"]
     sample_rate: Float[Array, ""]
@@ -178,8 +166,10 @@ class Gains(eqx.Module):
 
         if faults is None:
             return self.measured(z_load, current)
-        seen = seen_through(faults, z_load, frequency_variable(self.frequency))
-        return disturbed(faults, self.measured(seen, current))
+        gain, crosstalk, capacitance = as_complex(faults)
+        s = frequency_variable(self.frequency)
+        outputs = self.measured(z_load * reciprocal(1 + s * capacitance * z_load), current)
+        return outputs.at[0].set(outputs[0] * (1 + gain) + crosstalk)
 
     def __call__(self, q: Float[Array, " q"]) -> Complex[Array, "output frequency"]:
         """The gains."""

@@ -18,9 +18,16 @@ of the calibrations again, which would take ten times as long. `etid.estimators.
 terms themselves, for many loads at once. Both estimates have the same errors against the truth, but
 they are not equal. They may differ by a standard error along the direction that one known resistor
 does not determine.
+
+**Errors of the instrument** are further z with a standard normal prior. A gain g, a crosstalk κ and
+a capacitance C change the outputs of a load (`etid.estimators.maximum_likelihood.gains`); g, κ and
+the known resistors θ also change the calibrations, whose minimum moves by
+
+    ∂c/∂θ = −H⁻¹ J W (∂terms/∂θ),
+
+with the H, J and W of `etid.estimators.sandwich`.
 """
 
-import abc
 import dataclasses
 from typing import NamedTuple
 
@@ -31,13 +38,13 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood import faults
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import Calibrations, Slopes
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
+from etid.results.instrument import Instrument
 from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, combined, reciprocal
@@ -60,105 +67,8 @@ class UnloadedEstimate(NamedTuple):
     log_variance_by_z: Float[Array, "z harmonic"]
 
 
-class AbstractGiven(eqx.Module):
-    """What is given of the feed of the loads: the gain to V_out, and the distribution of z.
-
-    Attributes:
-        frequency: The harmonics [Hz].
-        w_slope: ∂W₀/∂ log f.
-        slope: ∂W/∂z.
-        mean: z₀.
-        cov: Covariance of z.
-        shape: Unloaded voltage of the first calibration; None if it cannot be compared.
-        delay_width: Prior standard deviation of the trigger delay of a load [samples].
-        faults: Gain, crosstalk and capacitance by z; None if the instrument has no tolerances.
-    """
-
-    frequency: eqx.AbstractVar[Float[Array, " harmonic"]]
-    w_slope: eqx.AbstractVar[Complex[Array, " harmonic"]]
-    slope: eqx.AbstractVar[Complex[Array, "z harmonic"]]
-    mean: eqx.AbstractVar[Float[Array, " z"]]
-    cov: eqx.AbstractVar[Float[Array, "z z"]]
-    shape: eqx.AbstractVar[UnloadedShape | None]
-    delay_width: eqx.AbstractVar[Float[Array, ""]]
-    faults: eqx.AbstractVar[Float[Array, "z 3"] | None]
-
-    @abc.abstractmethod
-    def current(
-        self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
-        """Current per input through this impedance [Ω] at W₀ + w."""
-
-    @abc.abstractmethod
-    def at_knots(self, knots: Knots) -> "AbstractGiven":
-        """The same at the knots of the harmonics, without an estimate of X."""
-
-    @abc.abstractmethod
-    def unloaded(self, records: Records) -> UnloadedEstimate | None:
-        """The X of a recording that the calibrations estimate; None if they share none with it."""
-
-    @abc.abstractmethod
-    def starts(
-        self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
-    ) -> LoadUnknowns:
-        """Starts of the fit of a recording, stacked; the likeliest is the last."""
-
-
-class GivenCurrent(AbstractGiven):
-    """A measured current: the gain is Z_L, and there is no z."""
-
-    frequency: Float[Array, " harmonic"]
-    w_slope: Complex[Array, " harmonic"]
-    slope: Complex[Array, "0 harmonic"]
-    mean: Float[Array, "0"]
-    cov: Float[Array, "0 0"]
-    delay_width: Float[Array, ""]
-    shape: UnloadedShape | None = None
-    faults: Float[Array, "z 3"] | None = None
-
-    @classmethod
-    def at(cls, frequency: Float[Array, " harmonic"]) -> "GivenCurrent":
-        """The measured current of loads with these harmonics [Hz]."""
-        slope = jnp.zeros((0, frequency.size), complex)
-        nothing = jnp.zeros_like(frequency, dtype=complex)
-        none, width = jnp.zeros(0), jnp.array(DELAY_WIDTH)
-        return cls(
-            frequency=frequency,
-            w_slope=nothing,
-            slope=slope,
-            mean=none,
-            cov=jnp.zeros((0, 0)),
-            delay_width=width,
-        )
-
-    def current(
-        self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
-        """1: the input is the current."""
-        del w
-        return jnp.ones_like(total)
-
-    def at_knots(self, knots: Knots) -> "GivenCurrent":
-        """The same at the knots of the harmonics."""
-        return GivenCurrent.at(knots.at(self.frequency))
-
-    def unloaded(self, records: Records) -> None:
-        """None: there are no calibrations."""
-        del records
-
-    def starts(
-        self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
-    ) -> LoadUnknowns:
-        """Starts at the impedance level of the records; the likeliest has the best time scale."""
-        del sample_rate
-        x, y = (jnp.where(spectrum.selected, one, 0) for one in (spectrum.x, spectrum.y))
-        variances = spectrum.variance_x, spectrum.variance_y
-        starts = current_starts(spectrum.frequency, (x, y), variances, circuit)
-        return LoadUnknowns(starts, jnp.zeros(starts.shape[0]))
-
-
-class GivenDriver(AbstractGiven):
-    """The distribution of Z_th at the harmonics of the loads, given the calibrations.
+class GivenDriver(eqx.Module):
+    """What is given of the feed of the loads: the distribution of Z_th, or a measured current.
 
     Attributes:
         frequency: The harmonics [Hz]. The harmonics of a load may differ from them by a small
@@ -172,9 +82,10 @@ class GivenDriver(AbstractGiven):
         records: The calibrations, if a load may have the unloaded record of one of them.
         gains: Gains of these calibrations.
         gain_slopes: Derivatives of these gains with respect to z.
-        shape: Unloaded voltage of the first calibration; None if loads have other harmonics.
+        shape: Unloaded voltage of the first calibration; None if it cannot be compared.
         delay_width: Prior standard deviation of the trigger delay of a load [samples].
         faults: Gain, crosstalk and capacitance by z; None if the instrument has no tolerances.
+        by_current: Whether the input is a measured current: the gain is Z_L, and there is no z.
     """
 
     frequency: Float[Array, " harmonic"]
@@ -190,6 +101,25 @@ class GivenDriver(AbstractGiven):
     shape: UnloadedShape | None = None
     delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
     faults: Float[Array, "z 3"] | None = None
+    by_current: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def measured(cls, frequency: Float[Array, " harmonic"]) -> "GivenDriver":
+        """The measured current of loads with these harmonics [Hz]."""
+        nothing, none = jnp.zeros_like(frequency, dtype=complex), jnp.zeros(0)
+        return cls(
+            frequency=frequency,
+            loaded=nothing,
+            w_slope=nothing,
+            slope=nothing[None][:0],
+            resistance=jnp.zeros(()),
+            mean=none,
+            cov=jnp.diag(none),
+            records=None,
+            gains=None,
+            gain_slopes=None,
+            by_current=True,
+        )
 
     def z_th(self, w: Complex[Array, " harmonic"]) -> Complex[Array, " harmonic"]:
         """Z_th [Ω] at W₀ + w."""
@@ -203,13 +133,24 @@ class GivenDriver(AbstractGiven):
     def current(
         self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
     ) -> Complex[Array, " harmonic"]:
-        """1 / (Z + Z_th) [S] at W₀ + w."""
+        """Current per input through this impedance [Ω] at W₀ + w."""
+        if self.by_current:
+            return jnp.ones_like(total)
         return reciprocal(total + self.z_th(w))
 
     def starts(
         self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
     ) -> LoadUnknowns:
-        """Starts at several impedance levels, and a simpler estimate."""
+        """Starts of the fit of a recording, stacked; the likeliest is the last.
+
+        They have several impedance levels and a simpler estimate, or, behind a current, the
+        impedance level of the records and several time scales.
+        """
+        if self.by_current:
+            x, y = (jnp.where(spectrum.selected, one, 0) for one in (spectrum.x, spectrum.y))
+            variances = spectrum.variance_x, spectrum.variance_y
+            starts = current_starts(spectrum.frequency, (x, y), variances, circuit)
+            return LoadUnknowns(starts, jnp.zeros(starts.shape[0]))
         z_th = self.z_th(jnp.zeros_like(self.loaded))
         return harmonic_starts(spectrum, sample_rate, z_th, circuit)
 
@@ -254,19 +195,17 @@ class GivenDriver(AbstractGiven):
 def given(
     driver: HarmonicDriver, frequency: Float[Array, " harmonic"], shared: bool
 ) -> GivenDriver:
-    """The distribution of Z_th given the calibrations; it is the same for all loads.
+    """The distribution of Z_th given the calibrations, at the harmonics of the loads [Hz].
 
-    Args:
-        driver: The driver.
-        frequency: Harmonics of the loads [Hz].
-        shared: Whether the unloaded record of a load may be that of a calibration.
+    `shared` says whether the unloaded record of a load may be that of a calibration.
     """
     calibrations = Calibrations.of(driver)
     c = calibrations.start()
     near = calibrations.near(c)
     linear = calibrations.linear(near)
     root = inverse_root(linear.curvature().expected)
-    mean, cov = -root.T @ (near.jacobian @ near.terms), linear.along(root).curvature().score
+    mean = -root.T @ calibrations.gradient(near, linear)
+    cov = linear.along(root).curvature().score
     # Later changes of the driver and errors of the instrument are further z.
     later, instrument = jnp.zeros((c.size, 0)), driver.instrument
     if driver.drift is not None:
@@ -274,23 +213,37 @@ def given(
         later = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
     shown = jnp.zeros((c.size, 0))
     if instrument is not None:
-        shown = faults.moved(instrument, calibrations, near, linear, root)
+        changes = near.condensed.rows(_by_instrument(instrument, calibrations, near.slopes))
+        shown = -root @ (root.T @ linear.told(changes).T)
     directions = jnp.concatenate([root, later, shown], axis=1)
-    more = later.shape[1] + shown.shape[1]
+    others = c.size + later.shape[1]
+    more = directions.shape[1] - c.size
     mean = jnp.pad(mean, (0, more))
     cov = jax.scipy.linalg.block_diag(cov, jnp.eye(more))
     found = around(calibrations, c, directions, frequency, shared, mean, cov)
     if found.gain_slopes is not None and more:  # the calibrations tell nothing about later changes
-        gain_slopes = found.gain_slopes.at[c.size : directions.shape[1] - shown.shape[1]].set(0.0)
+        gain_slopes = found.gain_slopes.at[c.size : others].set(0.0)
         if instrument is not None:
-            at = calibrations.slopes(c)
-            direct = faults.of_calibrations(instrument, calibrations, at)
+            direct = _by_instrument(instrument, calibrations, calibrations.slopes(c))
             gain_slopes = gain_slopes.at[-direct.shape[0] :].add(direct)
         found = dataclasses.replace(found, gain_slopes=gain_slopes)
     if instrument is not None:
-        by_z = faults.by_z(instrument, calibrations, root.shape[1] + later.shape[1])
+        room = (others, driver.calibration.r_load.size)
+        by_z = jnp.pad(jnp.diag(instrument.of_loads()), (room, (0, 0)))
         found = dataclasses.replace(found, faults=by_z)
     return dataclasses.replace(found, shape=shape_of(driver, frequency))
+
+
+def _by_instrument(
+    instrument: Instrument, calibrations: Calibrations, at: Slopes
+) -> Complex[Array, "z record frequency"]:
+    """Changes of the gains of the calibrations by each error, at constant Z_th."""
+    r_load = as_complex(calibrations.calibration.r_load)[:, None]
+    turned = at.gains * (r_load + at.z) / r_load
+    each = as_complex(jnp.eye(r_load.shape[0]))[:, :, None] * (-at.by_z * at.z)[None]
+    of = as_complex(instrument.of_loads())[:, None, None]
+    together = jnp.stack([at.gains, turned, jnp.zeros_like(turned)]) * of
+    return jnp.concatenate([together, each * as_complex(jnp.asarray(instrument.r_load))])
 
 
 def around(
@@ -311,7 +264,7 @@ def around(
     known = None
     if shared:
         of = calibrations.slopes(c)
-        gains, known = of.gains, combined(directions.T, of.by_common.reshape(c.size, -1))
+        gains, known = of.gains, combined(directions.T, of.by_unknown.reshape(c.size, -1))
         known = known.reshape(-1, *gains.shape)
     return GivenDriver(
         frequency=frequency,

@@ -11,56 +11,22 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.condensed import Condensed, apart
+from etid.estimators.maximum_likelihood.condensed import Condensed, Near, apart
 from etid.estimators.maximum_likelihood.gains import (
     AbstractOutputs,
     Gains,
-    Slopes,
     Voltage,
     VoltageAndCurrent,
 )
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedEstimate
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver, UnloadedEstimate
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, combined, reciprocal, turns
-from etid.solvers.levenberg_marquardt import NormalEquations
-
-
-class Near(eqx.Module):
-    """A load near the parameters q₀.
-
-    Attributes:
-        q: q₀.
-        profile: The likelihood at all harmonics.
-        condensed: The same at the knots.
-        slopes: The gains and their derivatives at the knots.
-        by_x: Relative derivatives of X with respect to z at the knots; None if X does not depend
-            on z.
-    """
-
-    q: Float[Array, " q"]
-    profile: Profile
-    condensed: Condensed
-    slopes: Slopes
-    by_x: Complex[Array, "z knot"] | None
-
-    def by_unknown(self, slopes: Slopes) -> Complex[Array, "q output knot"]:
-        """Derivatives of G X/X̂ with respect to the parameters."""
-        found = slopes.by_unknown
-        if self.by_x is not None:
-            z = self.by_x[:, None] * slopes.gains[None]
-            found = found.at[found.shape[0] - z.shape[0] :].add(z)
-        return found[: self.q.size]
-
-    @property
-    def jacobian(self) -> Float[Array, "q part"]:
-        """Transposed Jacobian of the condensed terms."""
-        return self.condensed.rows(self.by_unknown(self.slopes))
 
 
 class Load(eqx.Module):
@@ -79,7 +45,7 @@ class Load(eqx.Module):
     @classmethod
     def behind(
         cls,
-        driver: AbstractGiven,
+        driver: GivenDriver,
         circuit: AbstractCircuit,
         records: Records,
         sample_rate: Float[Array, ""],
@@ -88,13 +54,7 @@ class Load(eqx.Module):
     ) -> "Load":
         """A recording that was made with `driver`.
 
-        Args:
-            driver: Distribution of Z_th at its harmonics, or the measured current.
-            circuit: Structure of the load.
-            records: The recording.
-            sample_rate: Its sampling rate [Hz].
-            prior: Prior of the elements; None without one.
-            measured: Its outputs; None for V_out, and for the current if there are two outputs.
+        Its outputs are V_out, and the current if there are two, unless `measured` says otherwise.
         """
         if measured is None:
             measured = Voltage() if records.y.shape[0] == 1 else VoltageAndCurrent()
@@ -153,48 +113,12 @@ class Load(eqx.Module):
             size, total = profile.size[0], every.summed(profile.size[0])
             by_x = every.summed(as_complex(size)[None, :] * relative)
             by_x = by_x * as_complex(1 / jnp.where(total > 0, total, 1.0))[None, :]
-        return Near(q, profile, condensed, slopes, by_x)
+        return Near(q, [profile], condensed, slopes, by_x)
 
     def by_x(self, near: Near) -> Float[Array, "z harmonic"]:
         """Derivatives of the objective by the z that X depends on, at each harmonic."""
         assert self.unloaded is not None
         return near.profile.by_x(self.known(near.q), *self.unloaded[2:])
-
-
-class AtKnots(eqx.Module):
-    """The condensed terms of a load near one point, of which some parameters are fixed.
-
-    Attributes:
-        gains: The gains at the knots.
-        near: The load near the point.
-        free: Which parameters are not fixed.
-    """
-
-    gains: Gains
-    near: Near
-    free: Bool[Array, " q"]
-
-    def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
-        """Terms at `q` and the priors."""
-        rest = (q - self.gains.centre(q)) / self.gains.widths(q)
-        return jnp.concatenate([self._terms(q, self.gains(q)), rest])
-
-    def _terms(
-        self, q: Float[Array, " q"], gains: Complex[Array, "output knot"]
-    ) -> Float[Array, " part"]:
-        if self.near.by_x is not None:
-            moved = self.gains.split(q)[2] - self.gains.split(self.near.q)[2]
-            gains = gains + gains * combined(moved, self.near.by_x)[None, :]
-        return self.near.condensed.terms(gains)
-
-    def equations(self, q: Float[Array, " q"]) -> NormalEquations:
-        """Normal equations of the records alone."""
-        slopes = apart(self.gains.slopes, q)
-        rows = self.near.condensed.rows(self.near.by_unknown(slopes))
-        rows = jnp.where(self.free[:, None], rows, 0.0)
-        rows = jnp.concatenate([rows, self._terms(q, slopes.gains)[None, :]])
-        products = rows @ rows.T  # one matrix product gives all sums
-        return NormalEquations(0.5 * products[-1, -1], products[:-1, -1], products[:-1, :-1])
 
 
 def changes(load: Load, near: Near) -> Complex[Array, "change output knot"]:
@@ -207,12 +131,12 @@ def changes(load: Load, near: Near) -> Complex[Array, "change output knot"]:
     _, circuits = other_circuit.changes(load.gains.impedance(near.q), frequency)
     alone = as_complex(jnp.eye(load.gains.outputs))[:, :, None]
     scales = alone * near.slopes.gains[None]
-    return jnp.concatenate([circuits[:, None] * near.slopes.by_load[None], scales])
+    return jnp.concatenate([circuits[:, None] * near.slopes.by_z[None], scales])
 
 
 def by_falling(load: Load, near: Near) -> Complex[Array, "output harmonic"]:
     """What a resistance that falls with its current adds to the outputs [V²]."""
     slopes, every = near.slopes, load.knots
-    sensitivity = slopes.by_load * (slopes.load * reciprocal(slopes.gains[0]))[None, :]
+    sensitivity = slopes.by_z * (slopes.z * reciprocal(slopes.gains[0]))[None, :]
     v_out = every.between(slopes.gains[0]) * near.profile.x
-    return falling_resistance.added_voltage(v_out, slopes.load, sensitivity, every)
+    return falling_resistance.added_voltage(v_out, slopes.z, sensitivity, every)

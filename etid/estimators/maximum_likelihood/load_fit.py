@@ -14,17 +14,21 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import judged, unless
-from etid.estimators.maximum_likelihood.condensed import means
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.condensed import Near, means
+from etid.estimators.maximum_likelihood.given_driver import around
 from etid.estimators.maximum_likelihood.load import Load, by_falling, changes
+from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import best_start, minimum
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
+from etid.results.driver import HarmonicDriver
 from etid.results.fit import Fit, Support
 from etid.results.verdicts import RESULTS
-from etid.signals.harmonics import signal_share
+from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, combined, power
-from etid.solvers.matrices import inverse_root
+from etid.solvers.matrices import inverse_root, root
 from etid.solvers.successive import Minimum
 
 # Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
@@ -61,14 +65,8 @@ class Found(NamedTuple):
 
 
 def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
-    """Identify the load of one recording.
-
-    Args:
-        load: The recording.
-        candidates: Starts, stacked; the likeliest is the last. The start that predicts best is
-            refined.
-    """
-    driver, element_prior = load.gains.driver, load.gains.prior
+    """Identify the load of one recording from its best start; the likeliest is the last."""
+    driver = load.gains.driver
     q, least = minimum(load, jnp.concatenate([best_start(load, candidates), driver.mean]))
     # Standard errors and tests are those of the last point; they do not change in a short step.
     at, near, every = least.point, least.near, load.knots
@@ -76,19 +74,17 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     profile, condensed = near.profile, near.condensed
     count, owned = load.gains.elements, load.gains.owned
     share, noise = signal_share(profile.x, records.variance_x), profile.excess(records)
-    linear, own_noise = _linear(load, least, share, noise)
-    jacobian, part = linear.jacobian, condensed.part
+    linear, own_noise = _linear(load, near, noise)
     prior = 1 / load.gains.widths(at) ** 2
     information = linear.bread()
     elements = information[:count]
     logs, late, z = load.gains.split(q)
     used = records.selected[0, every.index]
     moved = jnp.sqrt(jnp.max(jnp.where(used, power(load.gains.at(every).w(z)), 0.0)))
-    rest = prior * (at - load.gains.centre(at))
-    spread = jax.scipy.linalg.block_diag(jnp.diag(prior[:owned]), driver.cov)
+    rest, spread = _priors(load, at)
     tested = changes(load, near)
     rows = condensed.rows(tested)
-    found = other_circuit.scores(rows, linear, part, rest, spread, information, slice(count))
+    found = _scores(load, near, linear, information, rows)
     of_circuit, of_scales = (
         jax.tree.map(lambda leaf, which=which: leaf[which], found)
         for which in (slice(1 - load.gains.outputs or None), slice(-load.gains.outputs, None))
@@ -119,7 +115,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     )
     of_own = (elements[:, :owned] * prior[None, :owned]) @ elements[:, :owned].T
     of_driver = elements[:, owned:] @ driver.cov @ elements[:, owned:].T
-    by_term = elements @ jacobian
+    by_term = elements @ linear.jacobian
     shared = of_driver + (by_term * (linear.noise - own_noise)[None, :]) @ by_term.T
     # For an element without any effect the matrix product contains only rounding errors.
     unknown = jnp.diagonal(elements)
@@ -128,9 +124,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     # Increase of the Σ r² of the calibrations.
     strain = jnp.sum((change @ inverse_root(driver.cov)) ** 2)
     # Σ r² of the priors of elements, which a choice of circuits must weigh.
-    beside = jnp.zeros(())
-    if element_prior is not None:
-        beside = jnp.sum(((logs - element_prior.centre) / element_prior.width) ** 2)
+    beside = jnp.sum(load.rest(at)[:count] ** 2)
     squares, terms = 2 * profile.objective, load.terms
     estimate = Estimate(
         parameters=logs,
@@ -163,30 +157,67 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
 
 def covariance_of_priors(load: Load, least: Minimum) -> Float[Array, "q q"]:
     """H⁻¹: how the parameters move with the means of their priors."""
-    profile, records = least.near.profile, load.known(least.point)
-    share = signal_share(profile.x, records.variance_x)
-    return _linear(load, least, share, profile.excess(records))[0].bread()
+    near = least.near
+    return _linear(load, near, near.profile.excess(load.known(near.q)))[0].bread()
+
+
+def other_circuit_at(
+    spectrum: Spectrum,
+    own: LoadUnknowns,
+    sample_rate: Float[Array, ""],
+    circuit: AbstractCircuit,
+    driver: HarmonicDriver,
+) -> Bool[Array, ""]:
+    """Whether the harmonics show another circuit than one that was fitted by another criterion.
+
+    Z_th varies within its covariance. The elements need not be at a minimum, because the part of
+    the residual that they could still explain is projected out.
+    """
+    calibrations, deviations = Calibrations.of(driver), root(driver.later_cov())
+    common, count = calibrations.start(), deviations.shape[1]
+    directions = jnp.pad(deviations, ((0, common.size - count), (0, 0)))
+    z, unit = jnp.zeros(count), jnp.eye(count)
+    known = around(calibrations, common, directions, spectrum.frequency, False, z, unit)
+    load = Load.behind(known, circuit, Records.of(spectrum), sample_rate)
+    near = load.near(jnp.concatenate([own.vector(), z]))
+    linear, _ = _linear(load, near, near.profile.excess(load.records))
+    rows = near.condensed.rows(changes(load, near))
+    found = _scores(load, near, linear, linear.bread(), rows)
+    return other_circuit.Scores.of(found, gain=True).seen()
+
+
+def _scores(
+    load: Load,
+    near: Near,
+    linear: Linear,
+    information: Float[Array, "q q"],
+    rows: Float[Array, "change part"],
+) -> other_circuit.Score:
+    """Scores of the changes of the terms `rows`."""
+    part, priors, elements = near.condensed.part, _priors(load, near.q), slice(load.gains.elements)
+    return other_circuit.scores(rows, linear, part, *priors, information, elements)
+
+
+def _priors(load: Load, q: Float[Array, " q"]) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
+    """Gradient of the priors, and its covariance."""
+    precision, owned = 1 / load.gains.widths(q) ** 2, load.gains.owned
+    spread = jax.scipy.linalg.block_diag(jnp.diag(precision[:owned]), load.gains.driver.cov)
+    return precision * (q - load.gains.centre(q)), spread
 
 
 def _linear(
-    load: Load, least: Minimum, share: Float[Array, " harmonic"], noise: Float[Array, "..."]
+    load: Load, near: Near, noise: Float[Array, "output harmonic"]
 ) -> tuple[Linear, Float[Array, " part"]]:
-    """The terms at the minimum, and the part of their noise that only this recording has.
-
-    Args:
-        load: The recording.
-        least: Its minimum.
-        share: Share of signal at each harmonic.
-        noise: Noise of the innovations relative to the expected one.
-    """
-    profile, records = least.near.profile, load.known(least.point)
+    """The terms at a point, and the part of their noise that only this recording has."""
+    profile, records = near.profile, load.known(near.q)
     # All noise, or that of the outputs if V_th is shared.
     private = jnp.where(
         jnp.any(records.variance_x != load.records.variance_x),
         records.variance_y / profile.expected,
         1.0,
     )
-    values = jnp.stack([jnp.broadcast_to(share, noise.shape), noise, private * noise])
+    share = jnp.broadcast_to(signal_share(profile.x, records.variance_x), noise.shape)
+    values = jnp.stack([share, noise, private * noise])
     mean_share, mean_noise, own_noise = means([profile], load.knots, values)
-    prior = jnp.diag(1 / load.gains.widths(least.point) ** 2)
-    return Linear(least.near.jacobian, mean_share, mean_noise, prior), own_noise
+    priors = jnp.diag(1 / load.gains.widths(near.q))
+    return Linear(near.jacobian, mean_share, mean_noise, priors), own_noise

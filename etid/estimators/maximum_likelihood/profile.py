@@ -55,12 +55,7 @@ class Records(eqx.Module):
 
     @classmethod
     def of(cls, spectrum: Spectrum, *others: tuple[Array, Array]) -> "Records":
-        """V_th and V_out, and further outputs.
-
-        Args:
-            spectrum: Harmonics of the voltages.
-            others: Coefficients of each further output, and their variances.
-        """
+        """V_th and V_out, and further outputs: their coefficients and variances."""
         each = [(spectrum.y, spectrum.variance_y), *others]
         y, variance_y = (jnp.stack(of) for of in zip(*each, strict=True))
         s, selected = spectrum, jnp.tile(spectrum.selected, (len(each), 1))
@@ -194,9 +189,7 @@ class Profile(eqx.Module):
     ) -> Bool[Array, ""]:
         """Whether the innovations of an output show mains hum, as `stands_out` has it.
 
-        Args:
-            records: The records.
-            without: Part of the innovations that is no hum; None for none.
+        `without` is a part of the innovations that is no hum.
         """
         left = self.innovations if without is None else self.innovations - without
         squares = power(left) / self.expected

@@ -6,14 +6,18 @@ point (`etid.solvers.successive`).
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from etid.estimators.estimate import SOLVER
-from etid.estimators.maximum_likelihood.load import AtKnots, Load, Near
+from etid.estimators.maximum_likelihood.condensed import Near, apart
+from etid.estimators.maximum_likelihood.gains import Gains
+from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.unknowns import LoadUnknowns
+from etid.signals.transfer import combined
 from etid.solvers import least_squares, successive
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 
@@ -24,34 +28,51 @@ DISTANT = 0.1  # part of ½ Σ r² that a step promises, above which a point is 
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
 
 
-def _equations(_, q: Float[Array, " q"], terms: AtKnots) -> NormalEquations:
+class _AtKnots(NamedTuple):
+    """The condensed terms of a load near one point, of which some parameters are fixed."""
+
+    gains: Gains
+    near: Near
+    free: Bool[Array, " q"]
+
+
+def _equations(_, q: Float[Array, " q"], of: _AtKnots) -> NormalEquations:
     """Normal equations of the condensed terms, of the priors, and of the distance from the point.
 
     The distance keeps a step where the approximation holds (the proximal point algorithm of
     Rockafellar 1976). At the minimum it has no effect.
     """
-    found, prior, at = terms.equations(q), 1 / terms.gains.widths(q), terms.near.q
-    rest = prior * (q - terms.gains.centre(q))
-    near = jnp.where(jnp.arange(q.size) < terms.gains.owned, 1 / FARTHEST, 0.0)
-    off = near * (q - at)
+    near, at = of.near, of.near.q
+    slopes = apart(of.gains.slopes, q)
+    gains, rows = slopes.gains, near.condensed.rows(near.by_unknown(slopes))
+    if near.by_x is not None:
+        moved = of.gains.split(q)[2] - of.gains.split(at)[2]
+        gains = gains + gains * combined(moved, near.by_x)[None, :]
+    rows = jnp.where(of.free[:, None], rows, 0.0)
+    rows = jnp.concatenate([rows, near.condensed.terms(gains)[None, :]])
+    products = rows @ rows.T  # one matrix product gives all sums
+    prior = 1 / of.gains.widths(q)
+    rest = prior * (q - of.gains.centre(q))
+    close = jnp.where(jnp.arange(q.size) < of.gains.owned, 1 / FARTHEST, 0.0)
+    off = close * (q - at)
     return NormalEquations(
-        found.objective + 0.5 * (jnp.dot(rest, rest) + jnp.dot(off, off)),
-        found.gradient + prior * rest + near * off,
-        found.matrix + jnp.diag(prior**2 + near**2),
+        0.5 * (products[-1, -1] + jnp.dot(rest, rest) + jnp.dot(off, off)),
+        products[:-1, -1] + prior * rest + close * off,
+        products[:-1, :-1] + jnp.diag(prior**2 + close**2),
     ).finite()
 
 
 def _equations_of_load(_, q: Float[Array, " q"], load: Load) -> NormalEquations:
     """The same with the terms condensed at `q`, and the objective of all harmonics."""
     near, objective = _approximate(load, q)
-    terms = AtKnots(load.gains.at(load.knots), near, jnp.ones(q.size, bool))
+    terms = _AtKnots(load.gains.at(load.knots), near, jnp.ones(q.size, bool))
     return dataclasses.replace(_equations(None, q, terms), objective=objective).finite()
 
 
 def _approximate(load: Load, q: Float[Array, " q"]) -> tuple[Near, Float[Array, ""]]:
     """The load near `q`, and ½ Σ r² of all harmonics there."""
     near, rest = load.near(q), load.rest(q)
-    return near, near.profile.objective + 0.5 * jnp.dot(rest, rest)
+    return near, near.objective + 0.5 * jnp.dot(rest, rest)
 
 
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3)
@@ -69,7 +90,7 @@ def best_start(load: Load, candidates: LoadUnknowns) -> Float[Array, " own"]:
         return best
     # These starts have no delays, and an approximation so far from the minimum may lead away.
     solver = dataclasses.replace(ROUGHLY, equations=_equations_of_load)
-    return least_squares.stepped(lambda q, load: load(q), solver, best, load, STEPS)[0]
+    return least_squares.stepped(None, solver, best, load, STEPS)[0]
 
 
 def _best(load: Load, starts: Float[Array, "start own"]) -> Float[Array, " own"]:
@@ -114,7 +135,7 @@ def _search(start: Float[Array, " q"], load: Load) -> tuple[Float[Array, " q"], 
     def follow(
         q: Float[Array, " q"], near: Near, objective: Float[Array, ""]
     ) -> tuple[Float[Array, " q"], Float[Array, ""]]:
-        here = _equations(None, q, AtKnots(gains, near, every))
+        here = _equations(None, q, _AtKnots(gains, near, every))
         newton = here.newton()
         promised = -0.5 * jnp.dot(newton, here.gradient)
         close = successive.close(promised, objective, load.terms)
@@ -127,12 +148,10 @@ def _search(start: Float[Array, " q"], load: Load) -> tuple[Float[Array, " q"], 
             solver = dataclasses.replace(
                 WELL, rtol=rtol, ftol=ftol, damping=damping, equations=_equations
             )
-            terms = AtKnots(gains, near, free)
+            terms = _AtKnots(gains, near, free)
 
             def stepped(q: Float[Array, " q"]) -> tuple[Float[Array, " q"], Float[Array, ""]]:
-                q, (_, result, last) = least_squares.stepped(
-                    lambda q, of: of(q), solver, q, terms, STEPS
-                )
+                q, (_, result, last) = least_squares.stepped(None, solver, q, terms, STEPS)
                 return q, successive.promised(here.objective - last.objective, result)
 
             return jax.lax.cond(wanted, stepped, lambda q: (q, jnp.zeros(())), q)

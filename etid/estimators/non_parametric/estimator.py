@@ -4,6 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import (
@@ -11,17 +12,18 @@ from etid.estimators.estimator import (
     CHECKED,
     DETERMINED,
     HARMONICS,
+    AbstractEstimator,
     Description,
     serving,
 )
 from etid.estimators.judgement import SUCCESSFUL, judged, unless
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood.estimator import AbstractByMaximumLikelihood
 from etid.estimators.non_parametric.fit import fit_circuit
+from etid.estimators.refined_driver import from_harmonics
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
-from etid.estimators.score_tests.unloaded import UnloadedShape
+from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import harmonic_starts
-from etid.results.driver import HarmonicDriver
+from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS
@@ -32,7 +34,7 @@ CORRECTED = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
-class NonParametric(AbstractByMaximumLikelihood):
+class NonParametric(AbstractEstimator):
     """Maximum likelihood without a model of Z_th; calibrations need the same pulse rate."""
 
     name = "non_parametric"
@@ -49,6 +51,17 @@ class NonParametric(AbstractByMaximumLikelihood):
                 f"{self} knows Z_th at harmonics of {known:.6g} Hz only, but the recording has "
                 f"{pulse_rate:.6g} Hz; use method='maximum_likelihood'"
             )
+
+    def fit_driver(self, records: Harmonics, r_load: Float[Array, " record"], order: int) -> Driver:
+        """Identify a driver by maximum likelihood, which keeps its harmonics."""
+        return from_harmonics(records, r_load, order, "maximum_likelihood")
+
+    def known(
+        self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool
+    ) -> UnloadedShape | None:
+        """The unloaded voltage of the calibrations, if it can be compared."""
+        del shared
+        return shape_of(driver, frequency)
 
     def fit_load(
         self,

@@ -34,7 +34,8 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver, SourceImpedance
 from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum, as_list, same_unloaded
-from etid.signals.transfer import as_complex
+from etid.signals.transfer import as_complex, power
+from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import best_start
 from etid.solvers.matrices import inverse
 
@@ -50,13 +51,6 @@ def fit_circuit(
     candidates: LoadUnknowns,
 ) -> tuple[Estimate, Float[Array, " element"], Scores]:
     """Identify the load of one recording with the harmonics of its driver's calibrations.
-
-    Args:
-        circuit: Structure of the load.
-        driver: Driver whose calibrations have the same pulse rate.
-        spectrum: The recording.
-        sample_rate: Its sampling rate [Hz].
-        candidates: Starts, stacked; the start that predicts best is refined.
 
     Returns:
         The estimate, whose parameters are the logarithms of the elements, the bias that was
@@ -78,9 +72,7 @@ def fit_circuit(
     best = best_start(lambda q: model.terms(q, records), starts)
 
     def solve(records: list[Spectrum], start: Float[Array, " q"]) -> optx.Solution:
-        return optx.least_squares(
-            model.terms, SOLVER, start, args=records, max_steps=MAX_STEPS, throw=False
-        )
+        return least_squares(_terms, SOLVER, start, (model, records), MAX_STEPS)
 
     solution = solve(records, best)
     q = solution.value
@@ -91,11 +83,13 @@ def fit_circuit(
     clean = model.without_noise(q, records)
     jacobian = jax.jacfwd(model.terms)(q, clean)
     by_term = inverse(jacobian.T @ jacobian)[:elements] @ jacobian.T
-    part = model.private(q, clean)
-    rest = jacobian.shape[0] - 2 * count - len(known)
-    weights = jnp.concatenate([part, part, jnp.zeros(len(known)), jnp.ones(1), jnp.zeros(rest - 1)])
+    at = model.equation(q, clean)
+    others = jacobian.shape[0] - 2 * count
+    # The delay of the load is its own; those of the calibrations, before it, are shared.
+    alone = jnp.zeros(others).at[len(known)].set(1.0)
+    weights = jnp.concatenate([jnp.tile(at.own / at.variance, 2), alone])
     noise = excess(model.terms(q, records)[: 2 * count], selected)
-    noise = jnp.concatenate([noise, jnp.ones(rest + len(known))])
+    noise = jnp.concatenate([noise, jnp.ones(others)])
     own_cov = (by_term * (weights * noise)[None, :]) @ by_term.T
     shared = (by_term * ((1 - weights) * noise)[None, :]) @ by_term.T
     drift = None
@@ -103,6 +97,8 @@ def fit_circuit(
         drift = model.by_drift(q, clean, driver)
         by_drift = by_term[:, : 2 * count] @ drift.T
         shared = shared + by_drift @ by_drift.T
+    seen = model.equation(q, records)
+    squares = power(seen.error) / seen.variance  # also of harmonics that are not selected
     estimate = Estimate(
         parameters=(q - bias)[:elements],
         delay_samples=model.named(q)[0].delay_samples[None],
@@ -114,9 +110,14 @@ def fit_circuit(
         ),
         result=solution.result,
         steps=solution.stats["num_steps"],
-        hum=stands_out(model.squares(q, records), records[-1].frequency, records[-1].selected),
+        hum=stands_out(squares, records[-1].frequency, records[-1].selected),
     )
     return estimate, bias[:elements], _scores(model, q, records, driver.source, noise, drift)
+
+
+def _terms(q: Float[Array, " q"], of: tuple[Model, list[Spectrum]]) -> Float[Array, " term"]:
+    model, records = of
+    return model.terms(q, records)
 
 
 def _scores(

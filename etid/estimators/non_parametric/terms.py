@@ -3,19 +3,19 @@
 The equations are those of `etid.estimators.non_parametric.fit`.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.profile import Profile
+from etid.estimators.maximum_likelihood.profile import Profile, total
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver, SourceImpedance
-from etid.signals.harmonics import Spectrum, same_unloaded, signal_share
+from etid.signals.harmonics import Spectrum, real_parts, same_unloaded, signal_share
 from etid.signals.transfer import as_complex, delayed, frequency_variable, power, reciprocal
 
 CLEAR = 0.97  # smallest share of signal in the power of a calibration's Y, 15 dB
@@ -25,11 +25,6 @@ def clearly_shown(calibrations: list[Spectrum]) -> Bool[Array, "calibration harm
     """Harmonics that each calibration shows clearly."""
     shown = [s.selected & (signal_share(s.y, s.variance_y) > CLEAR) for s in calibrations]
     return jnp.stack(shown)
-
-
-def _total(values: list[Array]) -> Array:
-    """Sum of arrays."""
-    return sum(values[1:], start=values[0])
 
 
 def _root(x: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
@@ -51,6 +46,28 @@ class Measured(eqx.Module):
     by_x: list[Complex[Array, " harmonic"]]
     by_y: Float[Array, " harmonic"]
     apart: list[Complex[Array, " harmonic"]]
+
+
+class Equation(NamedTuple):
+    """The equation error of a load.
+
+    Attributes:
+        y: Y without the delay of the load.
+        load: Z_L.
+        z_th: Z_th and the sources of its errors.
+        error: e.
+        variance: Its variance.
+        own: The part of the variance that only the load has.
+        weight: 1/σ of both parts of e; 0 where a harmonic is not used.
+    """
+
+    y: Complex[Array, " harmonic"]
+    load: Complex[Array, " harmonic"]
+    z_th: Measured
+    error: Complex[Array, " harmonic"]
+    variance: Float[Array, " harmonic"]
+    own: Float[Array, " harmonic"]
+    weight: Float[Array, " harmonic"]
 
 
 class Model(eqx.Module):
@@ -91,66 +108,44 @@ class Model(eqx.Module):
             by_y.append(variance)
             used = clear | ~self.selected  # if not selected, use all: this avoids 0/0
             weights.append(jnp.where(used, 1 / (variance + power(slope) * s.variance_x), 0.0))
-        total = _total(weights)
-        parts = [w / total for w in weights]
-        mean = _total([as_complex(p) * one for p, one in zip(parts, z, strict=True)])
+        every = total(weights)
+        parts = [w / every for w in weights]
+        mean = total([as_complex(p) * one for p, one in zip(parts, z, strict=True)])
         return Measured(
             mean,
             [as_complex(p) * slope for p, slope in zip(parts, by_x, strict=True)],
-            _total([p**2 * variance for p, variance in zip(parts, by_y, strict=True)]),
+            total([p**2 * variance for p, variance in zip(parts, by_y, strict=True)]),
             [(one - mean) * as_complex(_root(2 * w)) for one, w in zip(z, weights, strict=True)],
         )
 
-    def _variance(
-        self,
-        q: Float[Array, " q"],
-        records: list[Spectrum],
-        y: Complex[Array, " harmonic"],
-        of: Measured,
-    ) -> tuple[Float[Array, " harmonic"], Float[Array, " harmonic"]]:
-        """Variance of e, and the part that only the load has; `y` is Y without the delay."""
-        spectrum = records[-1]
-        load = self.load(q, spectrum.frequency)
+    def equation(self, q: Float[Array, " q"], records: list[Spectrum]) -> Equation:
+        """The equation error of the load."""
+        spectrum, of = records[-1], self.z_th(q, records)
+        late, load = self.named(q)[0].delay_samples, self.load(q, spectrum.frequency)
+        y = delayed(spectrum.y, spectrum.frequency, -late, self.sample_rate)
         own = power(load + of.z) * spectrum.variance_y
-        rest = power(y) * of.by_y
+        variance = own + power(y) * of.by_y
         together, shared = -load, jnp.zeros((), dtype=bool)
         for slope, s in zip(of.by_x, records[:-1], strict=True):
             same = same_unloaded(spectrum.x, s.x)
             shared = shared | same
-            rest = rest + jnp.where(same, 0.0, power(y * slope) * s.variance_x)
+            variance = variance + jnp.where(same, 0.0, power(y * slope) * s.variance_x)
             together = together + jnp.where(same, y * slope, 0.0)
         of_x = power(together) * spectrum.variance_x
-        return own + rest + of_x, own + jnp.where(shared, 0.0, of_x)
-
-    def _in_time(
-        self, q: Float[Array, " q"], records: list[Spectrum]
-    ) -> Complex[Array, " harmonic"]:
-        """Y of the load, without its delay."""
-        spectrum = records[-1]
-        late = self.named(q)[0].delay_samples
-        return delayed(spectrum.y, spectrum.frequency, -late, self.sample_rate)
+        variance, own = variance + of_x, own + jnp.where(shared, 0.0, of_x)
+        weight = jnp.where(self.selected, jnp.sqrt(2 / variance), 0.0)
+        error = (load + of.z) * y - load * spectrum.x
+        return Equation(y, load, of, error, variance, own, weight)
 
     def terms(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " term"]:
         """Scaled e, the weak priors of the delays, and differences between calibrations."""
-        y, of = self._in_time(q, records), self.z_th(q, records)
-        load = self.load(q, records[-1].frequency)
-        variance, _ = self._variance(q, records, y, of)
-        weight = jnp.where(self.selected, jnp.sqrt(2 / variance), 0.0)
-        e = ((load + of.z) * y - load * records[-1].x) * as_complex(weight)
-        own, late = self.named(q)
+        at, (own, late) = self.equation(q, records), self.named(q)
         delays = jnp.append(late, own.delay_samples) / DELAY_WIDTH
-        parts = [e.real, e.imag, delays]
-        if len(of.apart) > 1:
-            apart = jnp.where(self.selected[None, :], jnp.stack(of.apart), 0.0).ravel()
-            parts += [apart.real, apart.imag]
+        parts = [real_parts(at.error * as_complex(at.weight)), delays]
+        if len(at.z_th.apart) > 1:
+            apart = jnp.where(self.selected[None, :], jnp.stack(at.z_th.apart), 0.0)
+            parts.append(real_parts(apart.ravel()))
         return jnp.concatenate(parts)
-
-    def squares(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
-        """|e|² divided by its variance, also for harmonics that are not selected."""
-        y, of = self._in_time(q, records), self.z_th(q, records)
-        load = self.load(q, records[-1].frequency)
-        e = (load + of.z) * y - load * records[-1].x
-        return power(e) / self._variance(q, records, y, of)[0]
 
     def without_noise(self, q: Float[Array, " q"], records: list[Spectrum]) -> list[Spectrum]:
         """The records with the Y of the load that all other records predict."""
@@ -188,37 +183,18 @@ class Model(eqx.Module):
         self, q: Float[Array, " q"], records: list[Spectrum]
     ) -> Float[Array, "change term"]:
         """Derivatives of e with respect to changes of the circuit and, last, a gain of Y."""
-        elements = self.named(q)[0].log_elements
-        impedance = self.circuit.with_log_values(elements).impedance()
-        spectrum, y, of = records[-1], self._in_time(q, records), self.z_th(q, records)
-        load, by_change = other_circuit.changes(impedance, spectrum.frequency)
-        weight = jnp.sqrt(2 / self._variance(q, records, y, of)[0])
-        weight = as_complex(jnp.where(self.selected, weight, 0.0))
-        e = by_change * ((y - spectrum.x) * weight)[None, :]
-        e = jnp.concatenate([e, ((load + of.z) * y * weight)[None, :]])
-        return jnp.concatenate([e.real, e.imag], axis=1)
+        impedance = self.circuit.with_log_values(self.named(q)[0].log_elements).impedance()
+        spectrum, at = records[-1], self.equation(q, records)
+        _, by_change = other_circuit.changes(impedance, spectrum.frequency)
+        e = by_change * (at.y - spectrum.x)[None, :]
+        e = jnp.concatenate([e, ((at.load + at.z_th.z) * at.y)[None, :]])
+        return real_parts(e * as_complex(at.weight)[None, :])
 
     def by_drift(
         self, q: Float[Array, " q"], records: list[Spectrum], driver: HarmonicDriver
     ) -> Float[Array, "parameter term"]:
         """Changes of e by one standard deviation of the drift of each parameter of Z_th."""
-        spectrum = records[-1]
-        source, unflatten = ravel_pytree(driver.source)
-
-        def changed(direction: Float[Array, " parameter"]) -> Complex[Array, " harmonic"]:
-            def z_th(p: Float[Array, " parameter"]) -> Complex[Array, " harmonic"]:
-                return unflatten(p).response(spectrum.frequency)
-
-            return jax.jvp(z_th, (source,), (direction,))[1]
-
-        y, of = self._in_time(q, records), self.z_th(q, records)
-        weight = jnp.sqrt(2 / self._variance(q, records, y, of)[0])
-        weight = jnp.where(self.selected, weight, 0.0)
-        e = jax.vmap(changed)(jnp.diag(driver.drift_std())) * (y * as_complex(weight))[None, :]
-        return jnp.concatenate([e.real, e.imag], axis=1)
-
-    def private(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
-        """Part of the variance of e that only the load has."""
-        y, of = self._in_time(q, records), self.z_th(q, records)
-        variance, own = self._variance(q, records, y, of)
-        return own / variance
+        at = self.equation(q, records)
+        slopes = driver.source.slopes(records[-1].frequency)
+        changed = slopes * as_complex(jnp.asarray(driver.drift_std()))[:, None]
+        return real_parts(changed * (at.y * as_complex(at.weight))[None, :])

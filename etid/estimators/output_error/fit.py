@@ -45,14 +45,11 @@ from etid.estimators.output_error.prediction import (
     measured,
     predict,
     residual_and_response,
-    scaled,
-    scaled_back,
     scaled_residual,
     state_scale,
 )
 from etid.estimators.sandwich import Curvature
-from etid.estimators.score_tests.bends_in_time import bends
-from etid.estimators.score_tests.other_in_time import EXACT, Shown, relaxed, score
+from etid.estimators.score_tests.other_in_time import EXACT, Shown, bends, relaxed, score
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance, loaded
 from etid.results.feed import CurrentSource, MeasuredCurrent
@@ -71,12 +68,9 @@ def fit_source(
     r_load: Float[Array, " record"],
     start: SourceImpedance,
 ) -> tuple[SourceImpedance, Estimate, Calibration]:
-    """Identify Z_th from one or several records with known resistors.
+    """Identify Z_th from one or several records with known resistors, stacked.
 
-    Args:
-        records: Records, stacked along a leading axis.
-        r_load: Resistor of each record [Ω].
-        start: Initial Z_th; its structure is the order.
+    The structure of `start` is the order.
 
     Returns:
         Z_th; the estimate, with parameters in the order of the flattened `start`; and the data of
@@ -195,14 +189,7 @@ def fit_circuit(
     starts: AbstractCircuit,
     element_prior: ElementPrior | None = None,
 ) -> tuple[AbstractCircuit, Estimate, Bool[Array, ""]]:
-    """Identify the load of one recording.
-
-    Args:
-        records: One recording.
-        driver: Its driver, or the measured current.
-        starts: Candidate starts, stacked along a leading axis; the one that predicts best is
-            refined.
-        element_prior: Prior of the elements; None without one.
+    """Identify the load of one recording from the best of several starts, stacked.
 
     Returns:
         The circuit; the estimate, whose parameters are the logarithms of the elements; and whether
@@ -234,7 +221,7 @@ def fit_circuit(
 
     def named(q: Float[Array, " q"]) -> tuple[Float[Array, " element"], Nuisance, Float[Array, ""]]:
         log_elements, nuisance, late_samples = named_scaled(q)
-        return log_elements, scaled_back(nuisance, start_scale), late_samples
+        return log_elements, start_scale.state_of(nuisance), late_samples
 
     def residual(q: Float[Array, " q"], late: Change) -> Float[Array, " term"]:
         log_elements, nuisance, late_samples = named(q)
@@ -245,9 +232,7 @@ def fit_circuit(
         if element_prior is not None:
             rest = (log_elements - element_prior.centre) / element_prior.width
             priors = jnp.concatenate([priors, rest])
-        if start_scale is not None:
-            priors = jnp.concatenate([priors, start_scale.known * named_scaled(q)[1].state])
-        return jnp.concatenate([terms, priors])
+        return jnp.concatenate([terms, priors, start_scale.known * named_scaled(q)[1].state])
 
     def refine(
         carry: tuple[Float[Array, " q"], Change], late_counts: Float[Array, ""]
@@ -280,18 +265,17 @@ def fit_circuit(
     # The directions of the state are orthogonal at these elements, not at those of the start.
     scale = state_scale(records, source, load(log_elements))
     at, named_all = ravel_pytree(
-        (log_elements, late_samples, source_vector, scaled(nuisance, scale))
+        (log_elements, late_samples, source_vector, scale.eta_of(nuisance))
     )
 
     def of_all(p: Float[Array, " p"]) -> tuple[Float[Array, " interval"], Float[Array, " lag"]]:
         log_elements, late_samples, vector, nuisance = named_all(p)
-        nuisance = scaled_back(nuisance, scale)
+        nuisance = scale.state_of(nuisance)
         change = jax.tree.map(lambda leaf: late_samples * leaf, late)
         behind, circuit = unflatten(vector), load(log_elements)
         return residual_and_response(records, behind, circuit, nuisance, change)
 
-    of_state = jnp.zeros_like(nuisance.state) if scale is None else scale.known
-    open_delay = Nuisance(of_state, zero, jnp.asarray(1 / DELAY_WIDTH**2))
+    open_delay = Nuisance(scale.known, zero, jnp.asarray(1 / DELAY_WIDTH**2))
     free = jnp.zeros(kept)
     known = free if element_prior is None else element_prior.precision
     priors = (known, 1 / late_std**2, jnp.zeros(sources), open_delay)

@@ -80,12 +80,9 @@ def bin_weights(size: int) -> Float[np.ndarray, " bin"]:
 
 
 def curvature(records: Records, at: Slopes, precision: Float[Array, " n"]) -> Curvature:
-    """Evaluate H and JᵀΣJ.
+    """H and JᵀΣJ; `precision` is that of independent priors and adds to the curvature.
 
-    Args:
-        records: One recording.
-        at: Derivatives at the minimum; the last parameter is the record's delay [samples].
-        precision: Precision of independent priors of the parameters; it adds to the curvature.
+    The last parameter is the delay of the record [samples].
     """
     h, slope, jacobian = at.h, at.slope, at.jacobian
     s = residual_variance(records, h)
@@ -108,18 +105,10 @@ def curvature(records: Records, at: Slopes, precision: Float[Array, " n"]) -> Cu
 def further(
     of: Curvature, gradient: Float[Array, " all"], kept: int
 ) -> tuple[Float[Array, " further"], Float[Array, " further"]]:
-    """Newton step of each further parameter alone, from a minimum over the first `kept` parameters.
+    """Newton step of each parameter after `kept` alone, from a minimum over those, and its error.
 
-    The step starts from 0, and the first parameters are free. Rao's score test has power only where
+    The step starts from 0, and the others are free. Rao's score test has power only where
     this step is large relative to its standard error.
-
-    Args:
-        of: Curvature over all parameters.
-        gradient: Gradient of the objective.
-        kept: Number of parameters at their minimum.
-
-    Returns:
-        The steps, and their standard errors.
     """
     h = of.expected
     others = h[kept:, :kept] @ inverse(h[:kept, :kept])

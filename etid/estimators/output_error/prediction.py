@@ -59,10 +59,7 @@ def prepare(
 ) -> Records:
     """The interpolated V_th of a recording, without the edges, where samples are missing.
 
-    Args:
-        m: One recording.
-        cutoff: As in `filtering.band_limited`.
-        samples: Number of samples before the padding; None if there is no padding.
+    `cutoff` is that of `filtering.band_limited`. Padding follows after `samples`, if given.
     """
     held, delayed = band_limited(m.v_th, cutoff), shiftable(m.v_out, cutoff)
     rows = jnp.arange(held.shape[0])
@@ -113,14 +110,24 @@ class StateScale(eqx.Module):
     directions: Float[Array, "state state"]
     known: Float[Array, " state"]
 
+    def state_of(self, nuisance: Nuisance) -> Nuisance:
+        """The nuisances with the state, from those with η."""
+        return eqx.tree_at(lambda one: one.state, nuisance, self.directions @ nuisance.state)
+
+    def eta_of(self, nuisance: Nuisance) -> Nuisance:
+        """The inverse of `state_of`."""
+        state = jnp.linalg.solve(self.directions, nuisance.state)
+        return eqx.tree_at(lambda one: one.state, nuisance, state)
+
 
 def state_scale(
     records: Records, source: SourceImpedance | CurrentSource, load: Rational | StateSpace
-) -> StateScale | None:
-    """The unknowns for the state of a loaded ladder; None for a ratio of polynomials."""
+) -> StateScale:
+    """The unknowns of a loaded ladder; for a ratio of polynomials they are the state itself."""
+    system = loaded(source, load, records.sample_rate)
     if isinstance(load, Rational):
-        return None
-    system, count = loaded(source, load, records.sample_rate), load.C.size
+        return StateScale(jnp.eye(system.C.size), jnp.zeros(system.C.size))
+    count = load.C.size
     first, zero = system.C.size - count, jnp.zeros(())
     largest = jnp.max(jnp.abs(records.hold[:, 0]) * records.used)
     least = records.sample_rate / records.intervals
@@ -135,21 +142,6 @@ def state_scale(
     turned = jnp.linalg.svd(jnp.linalg.qr(effects)[1])[2].T
     directions = jax.scipy.linalg.block_diag(jnp.eye(first), width[:, None] * turned)
     return StateScale(directions, (jnp.arange(system.C.size) >= first).astype(width.dtype))
-
-
-def scaled_back(nuisance: Nuisance, scale: StateScale | None) -> Nuisance:
-    """The nuisances with the state that η stands for."""
-    if scale is None:
-        return nuisance
-    return eqx.tree_at(lambda one: one.state, nuisance, scale.directions @ nuisance.state)
-
-
-def scaled(nuisance: Nuisance, scale: StateScale | None) -> Nuisance:
-    """The inverse of `scaled_back`."""
-    if scale is None:
-        return nuisance
-    state = jnp.linalg.solve(scale.directions, nuisance.state)
-    return eqx.tree_at(lambda one: one.state, nuisance, state)
 
 
 def impulse_response(system: StateSpace) -> Float[Array, " lag"]:
@@ -233,14 +225,7 @@ def late_calibration(
 
     The first part is a delay, which the skin's own delay absorbs. The second is an excess
     impedance; this function returns the derivatives with respect to it. They are 0 for a measured
-    current, which has no calibration.
-
-    Args:
-        records: One recording.
-        source: Z_th, or the source of a measured current.
-        load: The load.
-        r_load: Resistor of the calibration [Ω].
-        x0: State of the loaded driver at the start of the record.
+    current, which has no calibration. `x0` is the state of the loaded driver at the start.
     """
     if isinstance(source, CurrentSource):
         return Change(jnp.zeros_like(records.v_out[:, 0]), jnp.zeros(IMPULSE + 1))

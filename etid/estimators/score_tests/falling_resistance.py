@@ -52,12 +52,9 @@ class Falling(NamedTuple):
     def causes(
         self, squares: Float[Array, ""], terms: Float[Array, ""], others: Float[Array, " change"]
     ) -> Bool[Array, ""]:
-        """Whether the fall is seen and explains most of a misfit.
+        """Whether the fall is seen and explains most of the excess of Σ r² over its terms.
 
-        Args:
-            squares: Σ r².
-            terms: Its expected value.
-            others: Scores of the other changes [standard deviations].
+        `others` are the scores of other changes [standard deviations].
         """
         excess = squares - terms - UNSURE * jnp.sqrt(2 * terms)
         most = self.z >= jnp.max(jnp.abs(others))
@@ -100,19 +97,11 @@ def score(
     covariance: Float[Array, "q q"],
     elements: int,
 ) -> Falling:
-    """Score of a change of the outputs.
+    """Score of a change of the outputs, `added` for each unit of ε.
 
-    Args:
-        added: Derivatives of the outputs with respect to ε.
-        profile: The likelihood of the records.
-        share: Share of signal in the power of X.
-        noise: Variances of the innovations relative to those expected.
-        slopes: Derivatives of the gains with respect to the parameters at the knots.
-        knots: The knots of the harmonics.
-        rest: Gradient of the priors.
-        spread: Covariance of this gradient.
-        covariance: Inverse of the information.
-        elements: Number of elements, which are the first parameters.
+    `share` is that of the signal in the power of X, `noise` the variances of the innovations
+    relative to those expected, `rest` the gradient of the priors and `spread` its covariance.
+    `slopes` are those of the gains at the knots, and the elements are the first parameters.
     """
     weighted = profile.weighted(profile.whitened(added))
     parts = knots.summed(jnp.conj(weighted) * (profile.x * as_complex(share))[None, :]).ravel()

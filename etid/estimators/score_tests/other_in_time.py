@@ -15,7 +15,16 @@ records is V_th − σ_th² G* r / P, where r is the residual; its noise does no
 Behind a measured current the relaxations reach to the end of the band: one more pole in either
 channel, or a capacitance parallel to the load, is a fast relaxation, once delay and elements are
 fitted. Their scores have 0.85 to 1.0 of the standard deviations that the best test of each of these
-faults has. Together with `etid.estimators.score_tests.bends_in_time` the tests ask for ten changes.
+faults has.
+
+Three more changes behind a measured current are not linear: two faults of a record and one of the
+load, to first order in 1/U, where U is a voltage or current.
+
+- The current amplifier compresses its peaks: it shows i (1 − |i|/U), and V_out lacks Z_L |i| i / U.
+- The voltage amplifier compresses its peaks: it shows v (1 − |v|/U).
+- A resistance falls with its current. Like on harmonics
+  (`etid.estimators.score_tests.falling_resistance`), it adds −|u| u / U to the voltage u of the
+  relaxations, filtered by them: they are the load without its series resistance.
 """
 
 import dataclasses
@@ -29,6 +38,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.circuits.impedance import AbstractImpedance, realise
 from etid.estimators.output_error.information import Slopes, bin_weights, noise_power, padded_size
 from etid.estimators.output_error.prediction import (
+    IMPULSE,
     Change,
     Records,
     impulse,
@@ -42,7 +52,7 @@ from etid.estimators.score_tests.other_circuit import Score, relaxations, scores
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance
 from etid.results.feed import CurrentSource
-from etid.signals.filtering import CUTOFF, StateSpace, hold
+from etid.signals.filtering import CUTOFF, StateSpace, hold, simulate
 from etid.signals.transfer import as_complex
 from etid.solvers.matrices import inverse
 
@@ -61,7 +71,7 @@ PASSED = 0.5  # part of the power that the interpolation must pass
 BESIDE = 8  # bins on either side over which the power of V_th is averaged
 
 
-def in_time(records: Records, impedance: AbstractImpedance) -> StateSpace:
+def _in_time(records: Records, impedance: AbstractImpedance) -> StateSpace:
     """The load in continuous time."""
     load = impedance.in_time(records.sample_rate, records.hold.shape[0])
     return load if isinstance(load, StateSpace) else realise(load, records.sample_rate)
@@ -73,15 +83,8 @@ def relaxed(
     impedance: AbstractImpedance,
     nuisance: Nuisance,
 ) -> Change:
-    """Derivatives with respect to one more relaxation, for each time constant.
-
-    Args:
-        records: One recording.
-        source: Z_th, or the source of a measured current.
-        impedance: The load.
-        nuisance: Other unknowns of the recording.
-    """
-    rate, load = records.sample_rate, in_time(records, impedance)
+    """Derivatives with respect to one more relaxation, for each time constant."""
+    rate, load = records.sample_rate, _in_time(records, impedance)
     highest = CUTOFF * rate if isinstance(source, CurrentSource) else jnp.asarray(HIGHEST)
     corner, level = relaxations(impedance, rate / records.intervals, highest)
     count = corner.size
@@ -105,7 +108,7 @@ def _usable(k: Complex[Array, " bin"]) -> Bool[Array, " bin"]:
     return jnp.abs(k) ** 2 > PASSED
 
 
-def shared_noise(records: Records, at: Slopes) -> Complex[Array, " bin"]:
+def _shared_noise(records: Records, at: Slopes) -> Complex[Array, " bin"]:
     """Estimate of the noise of V_th, σ_th² G* r / P, where the interpolation passes it [V].
 
     It is the part of the noise that the residual shows. The rest does not depend on the residual.
@@ -127,6 +130,45 @@ def _smooth(power: Float[Array, " bin"]) -> Float[Array, " bin"]:
     return (total[last] - total[first]) / (last - first).astype(float)
 
 
+def bends(records: Records, impedance: AbstractImpedance, nuisance: Nuisance, at: Slopes) -> Change:
+    """Derivatives of the predicted voltage with respect to the three changes.
+
+    The signs are those of the predicted minus the measured voltage: a compressed voltage and a
+    falling resistance have a positive size, a compressed current a negative one.
+
+    The last is a resistance that falls. Their effect on the noise is not counted.
+    """
+    load = _in_time(records, impedance)
+    system, series = hold(load, records.sample_rate), load.D[0]
+    # The square of noise has a mean. So the signals are the best estimates from both records,
+    # whose noise does not depend on the residual.
+    known = _shared_noise(records, at)
+
+    def bent(
+        signal: Float[Array, " interval"], response: Float[Array, " lag"]
+    ) -> Float[Array, " interval"]:
+        """|v| v of a signal v, which has this response to the noise."""
+        size = padded_size(signal.size)
+        of_noise = jnp.fft.irfft(jnp.fft.rfft(response, size) * known, size)
+        v = (signal - of_noise[: signal.size]) * records.used
+        return jnp.abs(v) * v
+
+    def filtered(signal: Float[Array, " interval"]) -> Float[Array, " interval"]:
+        """The voltage of the load if this is its current, with straight lines between samples."""
+        lines = jnp.zeros_like(records.hold).at[:, 0].set(signal)
+        lines = lines.at[:-1, 1].set(jnp.diff(signal))
+        return simulate(system, lines, jnp.zeros_like(nuisance.state))[0]
+
+    current, noise = records.hold[:, 0], impulse()[:, 0]
+    v_out = simulate(system, records.hold, nuisance.state)[0]
+    bent_current = bent(current, noise)
+    bent_relaxing = bent(v_out - series * current, at.h - series * noise)
+    by_current, by_fall = jax.vmap(filtered)(jnp.stack([bent_current, bent_relaxing]))
+    by_fall = by_fall - series * bent_relaxing
+    columns = jnp.stack([by_current, bent(v_out, at.h), by_fall], axis=1)
+    return Change(columns, jnp.zeros((IMPULSE + 1, columns.shape[1])))
+
+
 def score(
     records: Records,
     change: Change,
@@ -137,17 +179,11 @@ def score(
     precision: Float[Array, " q"],
     elements: int,
 ) -> Score:
-    """Score of each relaxation.
+    """Score of each change.
 
-    Args:
-        records: One recording.
-        change: Derivatives with respect to the relaxations.
-        at: Derivatives with respect to the parameters.
-        source_cov: Covariance of the parameters of the source.
-        first: Index of the first parameter of the source.
-        rest: Gradient of the priors of the other parameters.
-        precision: Precision of these priors.
-        elements: Number of elements; their logarithms are the first parameters.
+    The elements are the first parameters, and the source, of which `source_cov` is the covariance,
+    begins at `first`. `rest` is the gradient of the priors of the others, and `precision` that of
+    these priors.
     """
     # Parameters of the source in standard deviations.
     values, vectors = jnp.linalg.eigh(source_cov)
@@ -174,7 +210,7 @@ def score(
     k, power = jnp.fft.rfft(impulse()[:, 0], size), noise_power(records, at.h, size)
     usable = _usable(k)
     scale = jnp.where(usable, jnp.sqrt(jnp.asarray(bin_weights(size)) / power), 0.0)
-    residual, of_th = jnp.fft.rfft(at.residual * volts, size), shared_noise(records, at)
+    residual, of_th = jnp.fft.rfft(at.residual * volts, size), _shared_noise(records, at)
     # The slopes with the best estimate of V_th. The slope of the delay, which is the last one,
     # contains V_out: it gets G times this estimate.
     noise = jnp.fft.rfft(of_lag, size, axis=0) * of_th[:, None]
@@ -199,7 +235,7 @@ def score(
     scaled = terms(rows)
     by_change, by_parameter = scaled[:count], scaled[count:]
     ones = jnp.ones(scaled.shape[1])
-    linear = Linear(by_parameter, ones, ones, jnp.diag(known))
+    linear = Linear(by_parameter, ones, ones, jnp.diag(jnp.sqrt(known)))
     return scores(
         by_change,
         linear,
@@ -233,11 +269,8 @@ class Shown(NamedTuple):
     ) -> "Shown":
         """Judge the scores behind a measured current; the last one is a resistance that falls.
 
-        Args:
-            found: The scores.
-            errors: Standard errors of the logarithms of the elements.
-            chi2: χ² of the fit: the noise of a record is known to a few per cent only.
-            least: |z| that the error of the prediction may have.
+        `errors` are those of the logarithms of the elements. The noise of a record is known to a
+        few per cent only, which χ² shows; the error of the prediction may have the |z| `least`.
         """
         z = jnp.nan_to_num(found.z) / jnp.sqrt(jnp.maximum(chi2, 1.0))
         shift = jnp.max(jnp.abs(found.size[:, None] * found.slope) / errors[None, :], axis=1)

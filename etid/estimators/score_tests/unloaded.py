@@ -96,12 +96,7 @@ class UnloadedShape(NamedTuple):
 
 
 def shape(spectrum: Spectrum, drift: Float[Array | np.ndarray, ""] | None = None) -> UnloadedShape:
-    """The unloaded voltage of a calibration, for a comparison with other records.
-
-    Args:
-        spectrum: The calibration.
-        drift: Drift of its driver.
-    """
+    """The unloaded voltage of a calibration whose driver has this drift."""
     f, size = spectrum.frequency, spectrum.x.shape[0]
     clear = signal_share(spectrum.x, spectrum.variance_x) > SIGNAL
     used = spectrum.selected & clear & (jnp.arange(size) >= FIRST)
@@ -121,14 +116,9 @@ def shape(spectrum: Spectrum, drift: Float[Array | np.ndarray, ""] | None = None
 
 
 def shape_of(driver: Driver, frequency: Float[Array, " harmonic"]) -> UnloadedShape | None:
-    """The unloaded voltage of the first calibration of a driver.
+    """The unloaded voltage of the first calibration of a driver, for loads of these harmonics [Hz].
 
-    Args:
-        driver: The driver.
-        frequency: Harmonics of the loads [Hz].
-
-    Returns:
-        The unloaded voltage; None if the driver has no harmonics, or another number than the loads.
+    None if the driver has no harmonics, or another number than the loads.
     """
     if not isinstance(driver, HarmonicDriver) or driver.spectra.x.shape[1:] != frequency.shape:
         return None

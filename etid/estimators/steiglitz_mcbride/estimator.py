@@ -28,18 +28,18 @@ IMPULSE = 512  # length of the impulse response of a discrete model [samples]
 
 def _score(
     m: Measurement,
-    coefficients: Float[Array, " n"],
-    predict: Callable[[Float[Array, " n"], Float[Array, " time"]], Float[Array, " time"]],
+    best: Rational,
+    predict: Callable[[Rational, Float[Array, " time"]], Float[Array, " time"]],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """χ² of a discrete model, and its squared distance to the minimum in standard errors."""
-    impulse = jnp.zeros(IMPULSE).at[0].set(1.0)
+    impulse, free = jnp.zeros(IMPULSE).at[0].set(1.0), best.num.size
 
     def scaled(c: Float[Array, " n"], _) -> Float[Array, " time"]:
-        h = predict(c, impulse)
-        s = m.sigma_out**2 + m.sigma_th**2 * jnp.sum(h**2)
-        return (predict(c, m.v_th) - m.v_out) / jnp.sqrt(s)
+        of = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
+        s = m.sigma_out**2 + m.sigma_th**2 * jnp.sum(predict(of, impulse) ** 2)
+        return (predict(of, m.v_th) - m.v_out) / jnp.sqrt(s)
 
-    equations = normal_equations(scaled, coefficients)
+    equations = normal_equations(scaled, jnp.concatenate([best.num, best.den[1:]]))
     return 2 * equations.objective / m.v_th.size, distance_to_minimum(equations)
 
 
@@ -69,14 +69,12 @@ class SteiglitzMcBride(AbstractEstimator):
     ) -> Driver:
         """The paper's estimate of Z_th (eqs. 4-6)."""
         best = iteration.driver_filter(records.v_th, records.v_out, r_load, order, self.iterations)
-        free = best.filter.num.size
 
         def score(m: Measurement, r: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-            def predict(c: Float[Array, " n"], v: Float[Array, " time"]) -> Float[Array, " time"]:
-                z_th = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
-                return iteration.terminal_voltage(z_th, Rational(r[None], jnp.ones(1)), v)[0]
-
-            return _score(m, jnp.concatenate([best.filter.num, best.filter.den[1:]]), predict)
+            load = Rational(r[None], jnp.ones(1))
+            return _score(
+                m, best.filter, lambda z_th, v: iteration.terminal_voltage(z_th, load, v)[0]
+            )
 
         chi2, distance = jax.vmap(score)(records, r_load)
         chi2 = chi2.max()
@@ -106,13 +104,9 @@ class SteiglitzMcBride(AbstractEstimator):
         z_th = Rational(driver.b, driver.a)
         best = iteration.skin_filter(m.v_th, m.v_out, z_th, self.iterations)
         circuit = iteration.skin_elements(best.filter, m.sample_rate)
-        free = best.filter.num.size
-
-        def predict(c: Float[Array, " n"], v: Float[Array, " time"]) -> Float[Array, " time"]:
-            load = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
-            return iteration.terminal_voltage(z_th, load, v)[0]
-
-        chi2, distance = _score(m, jnp.concatenate([best.filter.num, best.filter.den[1:]]), predict)
+        chi2, distance = _score(
+            m, best.filter, lambda load, v: iteration.terminal_voltage(z_th, load, v)[0]
+        )
         values = circuit.values()
         unstable = ~jnp.isfinite(best.rrse)
         nothing = jnp.full((values.size, values.size), jnp.nan)

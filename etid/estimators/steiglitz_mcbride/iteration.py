@@ -14,6 +14,10 @@ Iteration 0 alone is the *equation error* estimate. Driver and skin differ only 
 On most recordings the iteration does not converge. Its fixed point is biased by noise, because X
 and W share the noise of V_out. The result is the iterate whose *simulated* terminal voltage fits
 best (RRSE, eq. 3).
+
+In the periodic steady state, a delay by k samples is a factor z⁻ᵏ. Eqs. (1), (2) become sums over
+harmonics of |X N_i − W D_i|² / |D_{i−1}|². No filter runs, so that a step takes a few per cent of
+one in time. An unstable D_{i−1} needs no reflected poles, because only |D_{i−1}| counts.
 """
 
 from collections.abc import Callable
@@ -24,13 +28,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import SkinRC
-from etid.results.fit import rrse
+from etid.results.fit import complex_rrse, rrse
 from etid.signals.filtering import lfilter
+from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import (
     Rational,
     add_polynomials,
+    as_complex,
+    delay_variable,
     is_stable,
     multiply_polynomials,
+    power,
+    reciprocal,
     reflect_poles,
 )
 
@@ -175,13 +184,6 @@ def driver_filter(
     """Identify the discrete Z_th from records with known resistors (paper, eqs. 4-6).
 
     Z_th = (α₀ + … + α₄ z⁻⁴) / (1 + β₁ z⁻¹ + … + β₅ z⁻⁵)                (4)
-
-    Args:
-        v_th: Unloaded voltages [V].
-        v_out: Voltages with the resistors [V].
-        r_load: The resistors [Ω].
-        order: Number of poles; the order of the numerator is one less.
-        iterations: Number of iterations; 1 is equation error.
     """
 
     def assess(candidate: Rational) -> tuple[Float[Array, ""], Bool[Array, ""]]:
@@ -200,20 +202,49 @@ def driver_filter(
     return iterate(in_time(v_out, w, order - 1, order), order - 1, order, assess, iterations)
 
 
+def periodic_driver_filter(
+    spectra: Spectrum,
+    r_load: Float[Array, " record"],
+    sample_rate: Float[Array, ""],
+    order: int,
+) -> Iterate:
+    """`driver_filter` from harmonics of the records, stacked."""
+    x, y = (jnp.where(spectra.selected, of, 0.0) for of in (spectra.x, spectra.y))
+    r = as_complex(r_load)[:, None]
+    w = r * (x - y)
+    z = delay_variable(spectra.frequency, sample_rate)
+    powers = [jnp.ones_like(z)]
+    while len(powers) <= order:
+        powers.append(powers[-1] * z)
+    delays = jnp.stack(powers)
+    rows = jnp.concatenate([delays[:-1] * y[None], -delays[1:] * w[None], w[None]])
+    rows = rows.reshape(2 * order + 1, -1)
+    parts = jnp.stack([rows.real, rows.imag], axis=1)
+
+    def solve(previous: Float[Array, " a"]) -> Rational:
+        den = jnp.tensordot(as_complex(previous), delays, 1).ravel()
+        weighted = parts / jnp.sqrt(power(den))[None, None, :]
+        return least_squares(weighted.reshape(parts.shape[0], -1).T, order)
+
+    def assess(candidate: Rational) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+        num = jnp.tensordot(as_complex(candidate.num), delays[:-1], 1)
+        forward = r * jnp.tensordot(as_complex(candidate.den), delays, 1)
+        predicted = forward * reciprocal(forward + num) * x
+        closed = [add_polynomials(of * candidate.den, candidate.num) for of in r_load]
+        stable = jnp.stack([is_stable(one) for one in closed]).all()
+        error = jax.vmap(complex_rrse)(predicted, y).max()
+        return jnp.where(stable & jnp.isfinite(error), error, jnp.inf), stable
+
+    return iterate(solve, order - 1, order, assess)
+
+
 def skin_filter(
     v_th: Float[Array, " time"],
     v_out: Float[Array, " time"],
     z_th: Rational,
     iterations: int = ITERATIONS,
 ) -> Iterate:
-    """Identify the discrete first-order Z_bio (paper, eqs. 7-9).
-
-    Args:
-        v_th: Unloaded voltage [V].
-        v_out: Voltage with the skin as load [V].
-        z_th: Discrete source impedance, a rational function of z⁻¹.
-        iterations: Number of iterations; 1 is equation error.
-    """
+    """Identify the discrete first-order Z_bio (paper, eqs. 7-9)."""
 
     def assess(candidate: Rational) -> tuple[Float[Array, ""], Bool[Array, ""]]:
         predicted, stable = terminal_voltage(z_th, candidate, v_th)

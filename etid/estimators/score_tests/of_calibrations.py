@@ -1,0 +1,135 @@
+"""Score tests of the calibrations of a driver: for a missing pole, and of the known resistors.
+
+Both project the effect of the common parameters out of further changes of the calibrations
+(`etid.estimators.sandwich`).
+
+**A missing pole.** A Z_th whose order is too low can fit a calibration with χ² = 1 and a residual
+of the size of the noise. It can still be wrong by 5 %. At 60 dB, order 3 in place of 5 or 6 changes
+R_s by three per cent, ten of its standard errors. The missing part is smooth in frequency, and
+noise is not. Rao's score test therefore tests for one more section,
+
+    ∂Z_th = (g + h x) / (1 + 2ζx + x²),      x = s/ω,
+
+at g = h = 0, for three dampings and for each ω of a grid that covers the band. A single pole is
+ζ = 1 with g = h. The statistic has two degrees of freedom, and the largest of all sections decides.
+In the map of failures (`python -m benchmarks failure_map`) it is at most 15 if the order is high
+enough. It is at least 116 if a lower order changes an element by five of its standard errors.
+
+**Resistors.** Only ratios to Z_th are observable. The error of a single resistor is therefore not
+visible: Z_th has the same relative error. Several resistors must show the same Z_th. For each
+resistor the score test estimates how far its value differs from the value that the others show,
+with
+
+    ∂G/∂ log R = G Z_th / (R + Z_th) = G (1 − G₀),      G = G₀ e^(−jωτ).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float
+
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.condensed import Near, means
+from etid.estimators.sandwich import Linear
+from etid.recordings.preflight import Inspected
+from etid.signals.transfer import as_complex, combined, reciprocal
+
+MISSING_POLE = (
+    36.0  # χ² of two degrees of freedom; by chance one of about 100 sections has it once in 10⁶
+)
+DAMPINGS = (0.1, 0.3, 1.0)
+GRID = 36  # frequencies, eight per decade
+BEYOND = 3.0  # factor by which the grid exceeds the band; poles beyond the band still have effect
+# Standard errors; by chance one calibration in two million exceeds this.
+RESISTOR = 5.0
+# Relative error. Resistors of 0.1 % and meters are better. A smaller error changes an element by no
+# more than this.
+SMALLEST = 0.005
+# Part of the excess of chi2 that one wrong resistor must explain. Otherwise the records have
+# another fault, which can imitate a wrong resistor.
+EXPLAINED = 0.5
+# Factor by which rough values of |Z_th| may differ between resistors. At low frequency Z_th is real
+# to a few per cent.
+ROUGHLY = 3.0
+
+
+def sections(
+    frequency: Float[Array, " frequency"], highest: Float[Array, ""]
+) -> Complex[Array, "section 2 frequency"]:
+    """∂Z_th/∂g and ∂Z_th/∂h of all sections.
+
+    Args:
+        frequency: Frequencies [Hz].
+        highest: End of the band, which begins with the first frequency [Hz].
+    """
+    grid = jnp.geomspace(frequency[0] / BEYOND, highest * BEYOND, GRID)
+    omega, zeta = (of.ravel() for of in jnp.meshgrid(grid, jnp.asarray(DAMPINGS)))
+    x = frequency[None, :] / omega[:, None]
+    by_g = reciprocal(jax.lax.complex(1 - x * x, 2 * zeta[:, None] * x))
+    by_h = jax.lax.complex(-x * by_g.imag, x * by_g.real)
+    return jnp.stack([by_g, by_h], axis=1)
+
+
+def missing_pole(
+    calibrations: Calibrations, near: Near, linear: Linear
+) -> Float[Array, " section"]:
+    """Score statistic of each section: χ² with two degrees of freedom if the section is absent.
+
+    It is NaN if a section has no effect. `near` and `linear` are those of the minimum.
+    """
+    spectra = calibrations.spectra
+    # The harmonics of the records differ so little that the sections are equal.
+    frequency = calibrations.knots.at(spectra.frequency[0])
+    highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, frequency[0]))
+    by_z = sections(frequency, highest).reshape(-1, 1, frequency.size)
+    directions, others = linear.projected(near.condensed.rows(by_z * near.slopes.by_z[None]))
+    score = directions @ near.condensed.part - others @ calibrations.rest(near.q)
+    s, t = score.reshape(-1, 2).T  # of g and of h
+    by_g, by_h = jnp.moveaxis(directions.reshape(s.size, 2, -1), 1, 0)
+    aa, ab, bb = (of @ linear.noise for of in (by_g * by_g, by_g * by_h, by_h * by_h))
+    of_priors = (others @ linear.precision).reshape(s.size, 2, -1)
+    (more_aa, more_ab), (_, more_bb) = jnp.einsum(
+        "sic,sjc->ijs", of_priors, others.reshape(s.size, 2, -1)
+    )
+    aa, ab, bb = aa + more_aa, ab + more_ab, bb + more_bb
+    return (s * s * bb - 2 * s * t * ab + t * t * aa) / (aa * bb - ab * ab)
+
+
+def mismatch(calibrations: Calibrations, near: Near, linear: Linear) -> Float[Array, "2 record"]:
+    """Excess of each log R over the value that the other calibrations show, and its standard error.
+
+    `near` and `linear` are those of the minimum.
+    """
+    slopes, every = near.slopes, calibrations.knots
+    alone = as_complex(jnp.eye(slopes.gains.shape[0]))[:, :, None]
+    by_resistor = alone * (-slopes.z * slopes.by_z)[None]
+    rows = near.condensed.rows(by_resistor)
+    directions, others = linear.projected(rows)
+    own = jnp.sum(rows * linear.share[None, :] * directions, axis=1)
+    score = directions @ near.condensed.part - others @ calibrations.rest(near.q)
+    # Estimate the noise after the resistor that explains most: its error must not count as noise.
+    best = jnp.argmax(score**2 / own)
+    made = combined(others[best], slopes.by_unknown.reshape(linear.jacobian.shape[0], -1))
+    change = (made.reshape(slopes.gains.shape) - by_resistor[best]) * as_complex(score / own)[best]
+    part = calibrations.terms(near.profiles[0].gains + every.between(change))
+    noise = means(near.profiles, every, calibrations.noise(part)[None])
+    of_priors = jnp.sum((others @ linear.precision) * others, axis=1)
+    error = jnp.sqrt(jnp.sum(noise * directions**2, axis=1) + of_priors) / own
+    return jnp.stack([score / own, error])
+
+
+def disagree(
+    mismatch: Float[Array, "2 record"], chi2: Float[Array, ""], terms: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether a known resistor is seen to be wrong."""
+    off, error = mismatch
+    squares = (off / error) ** 2
+    # The errors use the noise without the wrong resistor; χ² uses the noise of the records.
+    left = jnp.maximum(chi2 / (1 + squares / terms), 1.0)
+    explained = squares * left > EXPLAINED * (chi2 - 1) * terms
+    return jnp.any((squares > RESISTOR**2) & (jnp.abs(off) > SMALLEST) & explained)
+
+
+def rough_impedance(calibration: Inspected, r_load: float) -> float:
+    """Rough |Z_th| [Ω] from a resistor [Ω] and the amplitudes of both records."""
+    x, y = (v - v.mean() for v in calibration.aligned)
+    return r_load * abs(float(x @ x / (y @ x)) - 1)
