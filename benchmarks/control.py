@@ -44,7 +44,7 @@ from benchmarks import control_hazards, ngspice
 from benchmarks.charts import INK, new_figure, save
 from benchmarks.control_plant import KINDS, Fingertip, Plant, Response
 from benchmarks.ladder import TWO
-from benchmarks.provenance import RESULTS, write_csv
+from benchmarks.machine import RESULTS, write_csv
 from benchmarks.runner import Target, at_most, option, report
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.state import ElectrodeState, TrackerState

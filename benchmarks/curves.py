@@ -18,10 +18,9 @@ import scipy.signal
 import etid
 from benchmarks import charts, peers, scale
 from benchmarks.large_file import large_file
+from benchmarks.machine import median_time, pin, write_csv
 from benchmarks.problem import START, Problem, harmonics, problem, problem_of, terms
-from benchmarks.provenance import write_csv
 from benchmarks.runner import QUICK, option
-from benchmarks.timing import median_time, pin
 from etid.estimators.maximum_likelihood.search import WELL
 from etid.signals.filtering import lfilter
 from etid.solvers.levenberg_marquardt import normal_equations

@@ -18,7 +18,7 @@ from jaxtyping import Array
 import etid
 from benchmarks.estimators import DEFAULT, NOTHING, Answer, Drivers, method_of
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
-from benchmarks.mappings import make_room
+from benchmarks.machine import make_room
 from benchmarks.selection_draws import choices
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
 from etid.estimators.registry import named

@@ -33,7 +33,7 @@ from benchmarks import failure_chart
 from benchmarks.estimators import DEFAULT, ELEMENTS, OURS, Answer
 from benchmarks.failure_axes import MOST, Cell, cells
 from benchmarks.failure_draws import Effort, answers
-from benchmarks.provenance import write_csv
+from benchmarks.machine import write_csv
 from benchmarks.rates import rate
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, tabled
 

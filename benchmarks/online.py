@@ -20,8 +20,8 @@ from tqdm import tqdm
 import etid
 from benchmarks import online_rival
 from benchmarks.ladder import TWO
+from benchmarks.machine import RESULTS, write_csv
 from benchmarks.online_alarms import LOADS, SOON, alarms
-from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.rivals import RivalError
 from benchmarks.runner import Target, at_least, at_most, option, report
 from etid.online.state import TrackerState

@@ -23,8 +23,8 @@ import etid
 from benchmarks import charts
 from benchmarks import paper_tables as tables
 from benchmarks.ladder import SOURCES
+from benchmarks.machine import write_csv
 from benchmarks.paper_tables import Row
-from benchmarks.provenance import write_csv
 from benchmarks.runner import QUICK, Target, at_most, option, report
 from etid.paper.tables import LABORATORIES as ENDS
 from etid.paper.tables import METHODS, ORDER, Outcome, identify

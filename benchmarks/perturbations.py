@@ -45,7 +45,7 @@ from benchmarks.estimators import (
 )
 from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS
-from benchmarks.mappings import make_room
+from benchmarks.machine import make_room
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
 from benchmarks.perturbed_study import REFERENCE, Truth, undisturbed
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, tabled

@@ -23,10 +23,9 @@ import h5py
 import numpy as np
 
 from benchmarks.large_file import LAYOUTS, large_file
+from benchmarks.machine import ROOT, cores, write_csv
 from benchmarks.one_run import READERS
-from benchmarks.provenance import ROOT, write_csv
 from benchmarks.runner import QUICK, Target, at_least, at_most, option, report
-from benchmarks.timing import cores
 from etid.estimators.registry import names
 from etid.identify import file as streaming
 

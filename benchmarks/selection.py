@@ -26,8 +26,8 @@ from benchmarks import selection_counts as counts
 from benchmarks.estimators import Answer
 from benchmarks.failure_axes import Cell
 from benchmarks.failure_draws import AUTO, Effort, answers
+from benchmarks.machine import median_time, write_csv
 from benchmarks.perturbed_study import DELAY
-from benchmarks.provenance import write_csv
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
 from benchmarks.runner import (
     FOLDER,
@@ -42,7 +42,6 @@ from benchmarks.runner import (
     tabled,
 )
 from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
-from benchmarks.timing import median_time
 from etid.selection.search import USUAL
 from etid.simulation import scenes
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 import etid
 from benchmarks.ladder import LOADS
-from benchmarks.mappings import make_room
+from benchmarks.machine import make_room
 from benchmarks.perturbed_study import DELAY, PARTS, drawn_driver
 from etid.circuits.circuit import (
     AbstractCircuit,

@@ -14,7 +14,7 @@ from collections import Counter
 import numpy as np
 
 import etid
-from benchmarks.provenance import write_csv
+from benchmarks.machine import write_csv
 from benchmarks.runner import option
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.registry import named, names

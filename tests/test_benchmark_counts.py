@@ -23,9 +23,9 @@ from benchmarks import (
 from benchmarks.estimators import NOTHING, Answer
 from benchmarks.failure_axes import MOST, cells
 from benchmarks.ladder import LOADS
+from benchmarks.machine import RESULTS, write_csv
 from benchmarks.online_alarms import Alarms
 from benchmarks.perturbed_study import Truth
-from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.rates import clopper_pearson, expected_covered, expected_rms, rate
 from benchmarks.runner import Target, report
 from benchmarks.speed_accuracy import Result, dominators, front, ranked
