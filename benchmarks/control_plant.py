@@ -153,7 +153,7 @@ class Pulse(NamedTuple):
 
 
 Told = Callable[[int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""What the tracker gets of a pulse, windows [V] and amplitudes, from its number and the true ones."""
+"""Windows [V] and amplitudes of a pulse as the tracker gets them, from its number and the true."""
 
 
 def closed_loop(
