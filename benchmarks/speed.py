@@ -17,8 +17,7 @@ import scipy.signal
 import etid
 from benchmarks import online, peers
 from benchmarks.machine import import_time, interpreter, median_time
-from benchmarks.peers import A, B
-from benchmarks.problem import LOAD, SAMPLES, Problem, harmonics, problem
+from benchmarks.peers import LOAD, SAMPLES, A, B, Problem, harmonics, problem
 from benchmarks.runner import QUICK, Target, report
 from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS
 from etid.signals.filtering import lfilter

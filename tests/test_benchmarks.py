@@ -24,7 +24,7 @@ from benchmarks import (
 )  # fmt: skip
 from benchmarks.__main__ import NAMES, asked
 from benchmarks.failure_draws import Effort
-from benchmarks.problem import START, ByNumPy, problem
+from benchmarks.peers import START, ByNumPy, problem
 from benchmarks.rivals import installed
 
 # What is run of each benchmark, what it writes into the folder {}, and what its output must say.
@@ -73,7 +73,7 @@ OWN = {"failure_map", "mutation", "scale", "speed", "speed_accuracy", "spice"}
 SMALLER = {
     amplitude_errors: {"SCENES": amplitude_errors.SCENES[:1], "POINTS": 2**9},
     amplitudes: {"FINER": (2,), "REPEATS": 1},
-    curves: {"LANES": (1, 2), "SAMPLES": (1_000,), "pin": lambda: None},
+    curves: {"LANES": (1, 2), "SAMPLES": (1_000,)},
     online: {"WARM": 3, "NOISES": (60.0,), "KINDS": 3},
     online_alarms: {"TIMES": 1},
     selection: {
@@ -126,8 +126,6 @@ def test_each_benchmark_runs_in_short_and_says_what_it_was_asked(
 ):
     if name == "control" and shutil.which("ngspice") is None:
         pytest.skip("ngspice is not installed; Debian package ngspice")
-    if name == "curves":  # processes are measured below
-        monkeypatch.setattr(scale, "measured", lambda *_: {"seconds": 1.0})
     if name == "amplitudes":
         monkeypatch.setattr(jax.config, "update", lambda *_: None)
     options, files, says = CASES[name]
