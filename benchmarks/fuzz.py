@@ -106,8 +106,8 @@ class _Child:
         self.process = CONTEXT.Process(target=child, args=(theirs, self.folder, self.log))
         self.process.start()
         theirs.close()
-        self.alive = self._answer(START) is not None
-        if not self.alive:
+        self.alive = True
+        if self._answer(START) is None:
             raise RuntimeError(f"no child process could be started:\n{self._last_words()}")
         return self
 
@@ -127,9 +127,7 @@ class _Child:
         answer = self._answer(PATIENCE * limit, limit) if began else None
         if answer is not None:
             return found | answer
-        self.alive = False
-        self.process.join(0.2)  # one that has died
-        hangs, pid = self.process.is_alive(), self.process.pid
+        hangs, pid, self.alive = self.alive, self.process.pid, False
         if hangs and pid is not None:
             os.kill(pid, signal.SIGUSR1)  # faulthandler says where it is
             time.sleep(0.3)
@@ -147,6 +145,7 @@ class _Child:
                     return None
             return self.pipe.recv()
         except (EOFError, ConnectionError):  # it has died
+            self.alive = False
             return None
 
     def _worked(self) -> float:
