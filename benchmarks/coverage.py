@@ -24,8 +24,8 @@ import numpy as np
 from tqdm import tqdm
 
 import etid
-from benchmarks.estimators import DEFAULT, Drivers
-from benchmarks.ladder import LOADS
+from benchmarks.estimators import DEFAULT, Drivers, found_by
+from benchmarks.ladder import LOADS, recorded
 from benchmarks.perturbed_study import drawn_driver
 from benchmarks.rates import COVERED, NORMAL_95, covered, expected_covered, expected_rms
 from benchmarks.runner import Target, at_most, option, report
@@ -33,8 +33,7 @@ from benchmarks.spice import DATA, ESTIMATORS, FOLDER, JOINT, scene_of
 from etid.recordings.remarks import Remark
 from etid.results.verdicts import counted
 from etid.simulation.published import REFERENCE
-from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
+from etid.simulation.scenes import Scene
 
 SILENT = 5.0  # standard errors by which a successful fit may not be wrong
 TARGETS = {
@@ -111,11 +110,10 @@ def scene(
     current_snr_db: float | None = None,
 ) -> Scene:
     """A dry and a damp fingertip behind the default transformer, and `more` trials of each."""
-    trials = [Trial(name, load) for name, load in LOADS.items()]
-    trials += [Trial(f"{MORE}/{n}{i}", load) for n, load in LOADS.items() for i in range(more)]
-    return Scene(
-        tuple(trials),
-        tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(resistors)),
+    every = LOADS | {f"{MORE}/{n}{i}": load for n, load in LOADS.items() for i in range(more)}
+    return recorded(
+        every,
+        {f"calibration/{i}": r for i, r in enumerate(resistors)},
         samples=samples,
         snr_db=snr_db,
         current_snr_db=current_snr_db,
@@ -131,11 +129,8 @@ def with_driver(of: Scene, number: int, parts: float) -> Scene:
 
 def compared(fit: etid.Fit | None, truth: Sequence[float]) -> tuple[np.ndarray, np.ndarray, str]:
     """Relative error and standard error of the elements of a fit, if there is one; its verdict."""
-    true = np.array(truth)
-    if fit is None:  # a calibration that pre-flight refuses
-        return np.full(true.size, np.nan), np.full(true.size, np.nan), "driver_failed"
-    error = np.asarray(fit.circuit.values()) / true - 1
-    return error, np.asarray(fit.stderr.values()) / true, fit.verdict
+    values, stderr, verdict = found_by(fit, len(truth))
+    return values / np.array(truth) - 1, stderr / np.array(truth), verdict
 
 
 def draw(fit: etid.Fit | None, truth: Sequence[float]) -> tuple:

@@ -21,8 +21,6 @@ from benchmarks.machine import median_time, write_csv
 from benchmarks.peers import START, Problem, harmonics, problem, problem_of, terms
 from benchmarks.runner import QUICK, option
 from etid.estimators.maximum_likelihood.search import WELL
-from etid.signals.filtering import lfilter
-from etid.solvers.levenberg_marquardt import normal_equations
 
 PINNED = True
 OPTIONS = (QUICK, option("--folder", default=pathlib.Path(), type=pathlib.Path))
@@ -55,20 +53,10 @@ def seconds(call: Callable[[], Any]) -> float:
 def calls(one: Problem) -> dict[str, Callable[[], Any]]:
     """What is measured against the number of samples, of a single record."""
     first = jax.tree.map(lambda leaf: leaf[0], one.lanes)
-    b, a, start, v = map(jnp.asarray, (peers.B, peers.A, START, one.records[0].v_th))
-    forward = jax.jit(lambda b, v: lfilter(b, a, v)[0])
-    gradient = jax.jit(jax.grad(lambda b, v: jnp.sum(lfilter(b, a, v)[0] ** 2)))
-
-    def three(q, v):
-        return lfilter(b, a.at[1:4].add(q), v)[0]
-
-    equations = jax.jit(lambda q, v: normal_equations(three, q, v))
+    start = jnp.asarray(START)
     harmonic = jax.jit(lambda q, first: WELL.equations(terms, q, one.load(first)))
     refine = jax.jit(peers.one_fit(one)["ours"])
-    return {
-        "filter": lambda: forward(b, v),
-        "gradient of the filter": lambda: gradient(b, v),
-        "normal equations of the filter": lambda: equations(jnp.zeros(3), v),
+    return peers.filter_calls(one.records[0].v_th) | {
         "harmonics and noise": lambda: harmonics(one.records[0]),
         "normal equations of the harmonics": lambda: harmonic(start, first),
         "LM fit on the harmonics": lambda: refine(first),

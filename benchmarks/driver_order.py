@@ -16,7 +16,6 @@ four poles at 60 dB, and five without noise.
 import argparse
 import collections
 import pathlib
-import tempfile
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -29,7 +28,7 @@ from benchmarks.coverage import compared, scene, with_driver
 from benchmarks.perturbed_study import PARTS
 from benchmarks.rates import NORMAL_95
 from benchmarks.runner import Target, at_least, option, report
-from benchmarks.spice import DATA, FOLDER
+from benchmarks.spice import DATA, FOLDER, imported
 from etid.results.tried_orders import AUTO, Order
 
 AS_GOOD = 1.1  # of 20 drivers with two skins, a root mean square is known to about 10 %
@@ -102,12 +101,9 @@ def spice_orders(folder: pathlib.Path, names: Iterable[str]) -> dict[str, int]:
     """The orders chosen for the calibrations of SPICE recordings, by name."""
     found = {}
     for name in names:
-        with tempfile.TemporaryDirectory() as work:
-            file = pathlib.Path(work, "study.h5")
-            etid.import_file(folder / f"{name}.npz", file)
-            with etid.read(file) as study:
-                calibrations = list(study.calibrations.recordings())
-                found[name] = etid.identify_driver(calibrations, order=AUTO, throw=False).order
+        with imported(folder / f"{name}.npz") as study:
+            calibrations = list(study.calibrations.recordings())
+            found[name] = etid.identify_driver(calibrations, order=AUTO, throw=False).order
     return found
 
 

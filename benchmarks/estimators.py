@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import etid
-from etid.circuits.circuit import SkinRC
+from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.registry import named, names
 from etid.identify.options import for_calibrations
 from etid.recordings.preflight import Inspected
@@ -150,3 +150,23 @@ def driver_of(
 def method_of(name: str) -> str | None:
     """A method as `identify_skin` takes it."""
     return None if name == DEFAULT else name
+
+
+def fits(
+    records: Sequence[etid.Recording],
+    driver: etid.Driver | None,
+    name: str,
+    circuit: AbstractCircuit | None = None,
+) -> list[etid.Fit | None]:
+    """What a method makes of recordings behind one driver; nothing without a driver."""
+    if driver is None:
+        return [None] * len(records)
+    found = etid.identify_skins(records, driver, method=method_of(name), circuit=circuit)
+    return [found[number] for number in range(len(found))]
+
+
+def found_by(fit: etid.Fit | None, size: int = len(ELEMENTS)) -> tuple[Elements, Elements, str]:
+    """Elements, standard errors and verdict of a fit; without one its driver failed."""
+    if fit is None:
+        return np.full(size, np.nan), np.full(size, np.nan), "driver_failed"
+    return np.asarray(fit.circuit.values()), np.asarray(fit.stderr.values()), fit.verdict

@@ -19,6 +19,7 @@ import scipy.signal
 from jaxtyping import Array, Float
 
 import etid
+from benchmarks.ladder import recorded
 from etid.circuits.circuit import SkinRC
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_start import start_of_skin
@@ -32,9 +33,9 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.batches import each
 from etid.identify.one import known_of
 from etid.recordings.preflight import Inspected
+from etid.signals.filtering import lfilter
 from etid.simulation.published import REFERENCE, TYPICAL
-from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
+from etid.solvers.levenberg_marquardt import normal_equations
 
 SAMPLES = 33_330  # ten pulse periods at 200 kHz
 LOAD = TYPICAL["dry"]
@@ -43,6 +44,22 @@ START = np.append(np.log([20e3, 100e3, 0.3e-9]), 0.0)
 SIDE_BY_SIDE = 98
 BY_SCIPY = 8  # lanes
 B, A = cast(tuple[np.ndarray, np.ndarray], scipy.signal.butter(6, 0.3))
+
+
+def filter_calls(v: Any) -> dict[str, Callable[[], Any]]:
+    """One pass, gradient and normal equations of three coefficients of a filter of order 6."""
+    v, b, a = map(jnp.asarray, (v, B, A))
+    forward = jax.jit(lambda b: lfilter(b, a, v)[0])
+    gradient = jax.jit(jax.grad(lambda b: jnp.sum(lfilter(b, a, v)[0] ** 2)))
+    equations = jax.jit(
+        lambda q: normal_equations(lambda q, _: lfilter(b, a.at[1:4].add(q), v)[0], q)
+    )
+    return {
+        "filter": lambda: forward(b),
+        "gradient": lambda: gradient(b),
+        "normal equations of 3": lambda: equations(jnp.zeros(3)),
+    }
+
 
 Run = Callable[[np.ndarray], Any]  # lanes by their numbers
 
@@ -90,13 +107,9 @@ def problem_of(study: etid.Study, driver: etid.Driver) -> Problem:
 
 def problem(samples: int, lanes: int, sample_rate: float = 200e3) -> Problem:
     """Simulate `lanes` trials of `samples` samples and identify their driver."""
-    scene = Scene(
-        tuple(Trial(f"loaded/{i}", LOAD) for i in range(lanes)),
-        (Trial("calibration/0", ResistorLoad(REFERENCE)),),
-        samples=samples,
-        sample_rate=sample_rate,
-        trigger_jitter_rms=50e-9,
-    )
+    loads = {f"loaded/{i}": LOAD for i in range(lanes)}
+    resistors = {"calibration/0": REFERENCE}
+    scene = recorded(loads, resistors, samples=samples, sample_rate=sample_rate)
     study = scene.simulate(seed=3)
     driver = etid.identify_driver(study["calibration/0"], method="maximum_likelihood", throw=False)
     return problem_of(study, driver)
