@@ -25,6 +25,7 @@ from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.registry import named, names
 from etid.identify.options import for_calibrations
 from etid.recordings.preflight import Inspected
+from etid.results.tried_orders import Order
 
 DEFAULT = "default"
 OURS = (DEFAULT, *names())
@@ -106,7 +107,7 @@ class Answer:
 class Drivers:
     """Drivers from calibrations; each is identified once for all methods that use the same."""
 
-    def __init__(self, order: int = 5):
+    def __init__(self, order: Order = 5):
         self.order = order
         self.known: dict[tuple, etid.Driver | None] = {}
         self.times: dict[str | None, list[float]] = {}
@@ -138,7 +139,7 @@ def shared(method: str | None) -> str | None:
 
 
 def driver_of(
-    calibrations: etid.Recording | Sequence[etid.Recording], method: str | None, order: int = 5
+    calibrations: etid.Recording | Sequence[etid.Recording], method: str | None, order: Order = 5
 ) -> etid.Driver | None:
     """The driver, whatever its verdict; None if pre-flight refuses a calibration."""
     try:
