@@ -107,7 +107,8 @@ def main(arguments: argparse.Namespace) -> bool:
     for snr_db in arguments.snr_db:
         usual = scene(snr_db, arguments.samples)
         drawn = [with_driver(usual, seed, PARTS) for seed in range(arguments.drivers)]
-        by_order = {order: found_with(order, drawn) for order in (AUTO, *arguments.orders)}
+        tried: list[Order] = [AUTO, *arguments.orders]
+        by_order = {order: found_with(order, drawn) for order in tried}
         good, chosen = right(by_order), by_order[AUTO]
         errors = ", ".join(f"{order} {of.rms:.2f}" for order, of in by_order.items())
         counts = collections.Counter(chosen.order.tolist())

@@ -108,7 +108,7 @@ class Drivers:
     """Drivers from calibrations; each is identified once for all methods that use the same."""
 
     def __init__(self, order: Order = 5):
-        self.order = order
+        self.order: Order = order
         self.known: dict[tuple, etid.Driver | None] = {}
         self.times: dict[str | None, list[float]] = {}
 

@@ -18,13 +18,11 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
-from benchmarks.ladder import TWO
 from benchmarks.machine import RESULTS, write_csv
-from benchmarks.online_alarms import LOADS, SOON, alarms
+from benchmarks.online_alarms import LIFTED, LOADS, SOON, Fingertip, alarms
 from benchmarks.rivals import RivalError, exchange, make
 from benchmarks.runner import Target, at_least, at_most, option, report
 from etid.online.state import TrackerState
-from etid.simulation.scenes import Scene, Trial
 
 PINNED = True
 TICK = 0.08  # of the time between two pulses, which 99 % of the ticks must keep to
@@ -41,7 +39,8 @@ ENVIRONMENT, WORKER = "filterpy", "benchmarks.rivals.kalman_by_filterpy"
 OFF = 0.05  # of the elements, by which its start differs from what the tracker has found
 WARM = 50  # ticks before the first that counts: compilation, and the start of every electrode
 KINDS = 60  # different pulses, over and over
-NOISES = (60.0, 40.0)  # [dB] of the false alarms
+NOISES = (60.0, 40.0)  # [dB] of the false alarms; the ticks have the first
+CHANGE = 1e-3  # random walk that the tracker expects in the ticks [1/√pulse]
 
 OPTIONS = (
     option("--electrodes", default=98),
@@ -122,18 +121,9 @@ def timed(
 
 def problem(electrodes: int, lifted: int) -> tuple[etid.Tracker, np.ndarray]:
     """A tracker, and pulses for it (pulse, electrode, sample)."""
-    trials = tuple(Trial(f"loaded/{i}", LOADS[i % len(LOADS)]) for i in range(electrodes))
-    study = Scene(trials, TWO, trigger_jitter_rms=50e-9).simulate(seed=0)
-    calibrations = list(study.calibrations.recordings())
-    driver = etid.identify_driver(calibrations)
-    tracker = etid.Tracker.of(driver, calibrations[0], electrodes=electrodes, change=1e-3)
-    records = list(study.loaded.recordings())
-    v_out = np.stack([r.v_th if i < lifted else r.v_out for i, r in enumerate(records)])
-    three = tracker.pulses(v_out)
-    noise = np.random.default_rng(1).standard_normal((KINDS // 3, *three.shape))
-    # As much noise again as the records have. Common noise would look like the driver.
-    many = three[None] + 0.01 * noise
-    return tracker, many.reshape(-1, *three.shape[1:])
+    display, loads = Fingertip(electrodes, NOISES[0], CHANGE), np.arange(electrodes) % len(LOADS)
+    loads[:lifted] = LIFTED
+    return display.tracker, np.stack([*display.pulses(loads, KINDS)])
 
 
 def seconds_of_filterpy(

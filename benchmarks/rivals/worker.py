@@ -2,7 +2,7 @@
 
 PROBLEM holds `name`, a module beside this one, run by the Python of its own environment. It has
 `skin` for one record and Z_th as measured, or `fit` for the residuals of `harmonic_fit`, or `batch`
-for all of a problem at once. Besides: `v_th`,
+of an estimator for all of a problem at once. Besides: `v_th`,
 `v_out`, `ref_th`, `ref_out` (draw, sample) [V], `r_ref` (draw,) [ohm], `start` (3,) in SI, `fs`,
 `f0` [Hz], `repeats`, and `budget` [s], after which no further draw is begun, but for the second; a
 first fit that took as long is the only one. RESULT gets the fields of `rivals.Outcome`, `versions`
@@ -22,6 +22,7 @@ import numpy as np
 
 from benchmarks.rivals import harmonic_fit, serve
 from benchmarks.rivals.records import measured_driver
+from benchmarks.rivals.roster import RIVALS
 
 FEWEST = 2  # draws
 
@@ -83,11 +84,15 @@ def solved(problem):
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     repeats, budget = int(problem.pop("repeats")), float(problem.pop("budget"))
-    rival = importlib.import_module(f"benchmarks.rivals.{problem.pop('name')}")
+    name = str(problem.pop("name"))
+    estimator = RIVALS[name].estimator
+    module = importlib.import_module(f"benchmarks.rivals.{name.removesuffix(f'_{estimator}')}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of trial steps; what comes of them is judged
-        batch = getattr(rival, "batch", None)  # of which the time is short
-        found = batch(problem, repeats) if batch else results(rival, problem, repeats, budget)
+        if estimator:  # of which the time is short
+            found = module.batch(estimator, problem, repeats)
+        else:
+            found = results(module, problem, repeats, budget)
     owners = importlib.metadata.packages_distributions()
     imported = sorted({owner for module in {*sys.modules} & {*owners} for owner in owners[module]})
     versions = {package: importlib.metadata.version(package) for package in imported}
