@@ -108,7 +108,7 @@ def main(arguments: argparse.Namespace) -> bool:
         usual = scene(snr_db, arguments.samples)
         drawn = [with_driver(usual, seed, PARTS) for seed in range(arguments.drivers)]
         tried: list[Order] = [AUTO, *arguments.orders]
-        by_order = {order: found_with(order, drawn) for order in tried}
+        by_order: dict[Order, Found] = {order: found_with(order, drawn) for order in tried}
         good, chosen = right(by_order), by_order[AUTO]
         errors = ", ".join(f"{order} {of.rms:.2f}" for order, of in by_order.items())
         counts = collections.Counter(chosen.order.tolist())
