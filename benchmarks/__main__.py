@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import jax
 
+from benchmarks.machine import pin
 from benchmarks.ngspice import NgspiceError
 from benchmarks.rivals import RivalError
-from benchmarks.timing import pin
 
 NAMES = (
     *("spice", "coverage", "driver_order", "delays", "noise", "selection", "design"),

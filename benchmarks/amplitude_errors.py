@@ -11,10 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.special import erf
 
 import etid
-from benchmarks.amplitudes import EDGES, PULSE_RATE, WIDTH
+from benchmarks import amplitudes
+from benchmarks.amplitudes import PULSE_RATE
 from benchmarks.coverage import HEADS, Draws, draw, lines, targets
 from benchmarks.runner import Target, option, report
 
@@ -35,8 +35,7 @@ POINTS = 2**13  # of the bound, per period: 0.25 µs, and the skin takes 0.7 µs
 
 def pulses(t: np.ndarray) -> np.ndarray:
     """A charge-balanced pulse of height 1 per period, without the factor `SLOWER`."""
-    first, second, third = (erf((t % PERIOD - at) / WIDTH) / 2 for at in EDGES)
-    return first - 2 * second + third
+    return amplitudes.pulses(t % PERIOD) / amplitudes.HEIGHT
 
 
 def voltage(amplitude: float, t: np.ndarray, elements: np.ndarray) -> np.ndarray:
@@ -54,14 +53,14 @@ def voltage(amplitude: float, t: np.ndarray, elements: np.ndarray) -> np.ndarray
     return found.sol(t % PERIOD)[0] + r_s * amplitude * pulses(t)
 
 
-def draws(amplitudes: Sequence[float], snr_db: float, count: int) -> Draws:
+def draws(heights: Sequence[float], snr_db: float, count: int) -> Draws:
     """Fits of `count` records, each with noise of its own."""
     t, level = np.arange(SAMPLES) / SAMPLE_RATE, 10 ** (-snr_db / 20)
     elements = np.array([R_S, R_P, C_P, I_0])
-    clean = [(voltage(one, t / SLOWER, elements), one * pulses(t / SLOWER)) for one in amplitudes]
+    clean = [(voltage(one, t / SLOWER, elements), one * pulses(t / SLOWER)) for one in heights]
     rows = []
     for seed in range(count):
-        rng = np.random.default_rng([seed, round(snr_db), len(amplitudes)])
+        rng = np.random.default_rng([seed, round(snr_db), len(heights)])
         of = []
         for pair in clean:
             v_out, current = (
@@ -77,7 +76,7 @@ def draws(amplitudes: Sequence[float], snr_db: float, count: int) -> Draws:
     return Draws.of(rows)
 
 
-def smallest_errors(amplitudes: Sequence[float], snr_db: float) -> np.ndarray:
+def smallest_errors(heights: Sequence[float], snr_db: float) -> np.ndarray:
     """Cramer-Rao bound of the relative standard error of each element; the delays are unknown.
 
     The residual of a record has the covariance C = σ_v² I + A A' σ_i² (of harmonics, halved for
@@ -86,8 +85,8 @@ def smallest_errors(amplitudes: Sequence[float], snr_db: float) -> np.ndarray:
     """
     t = np.arange(POINTS) / POINTS * PERIOD
     elements, step = np.array([R_S, R_P, C_P, I_0]), 1e-4
-    information = np.zeros((4 + len(amplitudes),) * 2)
-    for number, one in enumerate(amplitudes):
+    information = np.zeros((4 + len(heights),) * 2)
+    for number, one in enumerate(heights):
         v, i = voltage(one, t, elements), one * pulses(t)
         by_element = [
             (voltage(one, t, elements * np.exp(d)) - voltage(one, t, elements * np.exp(-d)))
@@ -96,7 +95,7 @@ def smallest_errors(amplitudes: Sequence[float], snr_db: float) -> np.ndarray:
         ]
         u = v - R_S * i
         slopes = 1 / (R_P * (1 - np.abs(u) / (R_P * I_0)) ** 2)  # of the current by u [S]
-        rows = np.zeros((4 + len(amplitudes), 2 * HARMONICS))
+        rows = np.zeros((4 + len(heights), 2 * HARMONICS))
         rows[:4] = _parts(np.array(by_element).T).T
         rows[4 + number] = _parts(np.gradient(v, t)[:, None])[:, 0] * PERIOD
         turns = 2 * np.pi * np.outer(t / PERIOD, np.arange(1, HARMONICS + 1))
@@ -135,12 +134,10 @@ def main(arguments: argparse.Namespace) -> bool:
     """Print the table; whether the targets are met."""
     asked, names = list[Target](), etid.SkinCurrent.names()
     print(HEADS)
-    for number, (amplitudes, snr_db) in enumerate(SCENES):
-        print(
-            f"scene {number}: {', '.join(f'{1e3 * of:g}' for of in amplitudes)} mA, {snr_db:g} dB"
-        )
-        found = draws(amplitudes, snr_db, arguments.draws)
-        least = dict(zip(names, smallest_errors(amplitudes, snr_db).tolist(), strict=True))
+    for number, (heights, snr_db) in enumerate(SCENES):
+        print(f"scene {number}: {', '.join(f'{1e3 * of:g}' for of in heights)} mA, {snr_db:g} dB")
+        found = draws(heights, snr_db, arguments.draws)
+        least = dict(zip(names, smallest_errors(heights, snr_db).tolist(), strict=True))
         print("\n".join(lines(f"scene {number}", found, least)), flush=True)
         asked += targets(f"scene {number}", found)
     return report(asked)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from benchmarks.provenance import provenance
+from benchmarks.machine import provenance
 from etid.plotting.style import COLOURS as COLOURS
 from etid.plotting.style import DASHES as DASHES
 from etid.plotting.style import INK as INK

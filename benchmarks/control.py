@@ -29,7 +29,7 @@ number of those that did. They excuse none. σ comes from the information of the
 
 import argparse
 import pathlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,21 +37,18 @@ import jax
 import numpy as np
 import scipy.special
 from jaxtyping import Array, Float
-from tqdm import tqdm
 
 import etid
 from benchmarks import control_hazards, ngspice
 from benchmarks.charts import INK, new_figure, save
-from benchmarks.control_plant import KINDS, Fingertip, Plant, Response
+from benchmarks.control_plant import KINDS, OLDER, Display, Fingertip, by_ngspice, closed_loop
 from benchmarks.ladder import TWO
-from benchmarks.provenance import RESULTS, write_csv
+from benchmarks.machine import RESULTS, write_csv
 from benchmarks.runner import Target, at_most, option, report
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.state import ElectrodeState, TrackerState
 from etid.plotting.style import BLUE, RED
-from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene
-from etid.simulation.transformer import ResistorLoad, SkinLoad
 from etid.solvers.matrices import inverse_of_few
 
 WANTED = 80e-9  # [C] per phase
@@ -95,12 +92,14 @@ def main(arguments: argparse.Namespace) -> bool:
     asked = list(hazards(arguments))
     fingertip = Fingertip(arguments.electrodes, arguments.pulses)
     runs: dict[str, Run] = {}
-    known: dict[SkinLoad | ResistorLoad, Response] = {}
     for snr in arguments.snr:
-        loop = Loop(fingertip, snr, known)
-        found = {"etid": loop.etid()}
+        scene = Scene((), TWO, samples=40_000, snr_db=snr, trigger_jitter_rms=100e-9)
+        display = Display(scene, fingertip.loads, 1, by_ngspice)
+        found = {"etid": identifying(scene, display, fingertip.load)}
         if not runs:
-            found |= {name: loop.blind(one) for name, one in rivals(loop).items()}
+            found |= {
+                name: blind(display, fingertip.load, one) for name, one in rivals(display).items()
+            }
         for name, run in found.items():
             print(f"{snr:g} dB  {name:<20}{run.text(fingertip.counts)}", flush=True)
         asked += found["etid"].targets(fingertip.counts, f"{snr:g} dB: ")
@@ -133,6 +132,11 @@ class Run(NamedTuple):
     fallback: np.ndarray  # whether the amplitude was the fallback
     allowed: np.ndarray  # probability that noise alone misses the target
 
+    @classmethod
+    def of(cls, rows: Sequence[tuple]) -> "Run":
+        """The same from one row a pulse."""
+        return cls(*map(np.array, zip(*rows, strict=True)))
+
     def errors(self, counts: np.ndarray) -> np.ndarray:
         """Relative errors of the charge of the pulses that count."""
         return np.abs(self.charge / WANTED - 1)[counts]
@@ -158,64 +162,42 @@ class Run(NamedTuple):
         yield Target(f"{at}{largest}", float(self.peak.max()), *TARGETS[largest])
 
 
-class Loop:
-    """One driver, one noise, all controllers.
-
-    Args:
-        fingertip: The skin.
-        snr: Signal-to-noise ratio [dB].
-        known: Responses of the plant, which do not depend on the noise.
-    """
-
-    def __init__(
-        self,
-        fingertip: Fingertip,
-        snr: float,
-        known: dict[SkinLoad | ResistorLoad, Response],
-    ) -> None:
-        self.fingertip, self.known = fingertip, known
-        self.scene = Scene((), TWO, samples=40_000, snr_db=snr, trigger_jitter_rms=100e-9)
-        self.lanes = len(fingertip.kind)
-        self.typical = Plant(self.scene, 0, known).response(TYPICAL["dry"])
-
-    def etid(self) -> Run:
-        """The tracker and the controller."""
-        records = list(ngspice.record(self.scene, 0).calibrations.recordings())
-        driver = etid.identify_driver(records)
-        tracker = etid.Tracker.of(driver, records[0], electrodes=self.lanes, change=CHANGE)
-        controller = etid.Controller.of(tracker, current_cap=CAP, fallback=FALLBACK)
-        plant, state = Plant(self.scene, 1, self.known), tracker.start(at_rest=True)
-        samples = tracker.model.bands.samples
-        before, rows = np.zeros(self.lanes), []
-        last = np.full(self.lanes, np.nan)  # charge per unit of amplitude, at the pulse before
-        for pulse, loads in enumerate(tqdm(self.fingertip.loads, leave=False)):
-            command, noise = controller.command(state, charge=WANTED), stderr(controller, state)
-            charge, peak, _ = plant.delivered(loads, command.amplitude, before)
-            v_out = plant.windows(pulse, samples, loads, command.amplitude, before)
-            state = tracker.update(state, v_out, command.amplitude)
-            now = np.array([plant.response(load).charge[0] for load in loads])
-            allowed = missing(now / last - 1, noise)
-            rows.append((charge, peak, command.reason == "fallback", allowed))
-            before, last = command.amplitude, now
-        return Run(*(np.array(column) for column in zip(*rows, strict=True)))
-
-    def blind(self, command: Command) -> Run:
-        """A controller that sees charge and voltage of the last pulse, without noise."""
-        plant = Plant(self.scene, 1, self.known)
-        amplitude, before = np.full(self.lanes, FALLBACK), np.zeros(self.lanes)
-        rows = []
-        for pulse, loads in enumerate(self.fingertip.loads):
-            charge, peak, voltage = plant.delivered(loads, amplitude, before)
-            rows.append((charge, peak, np.zeros(self.lanes, bool), np.zeros(self.lanes)))
-            before, amplitude = amplitude, command(pulse, amplitude, charge, voltage)
-        return Run(*(np.array(column) for column in zip(*rows, strict=True)))
+def identifying(scene: Scene, display: Display, load: np.ndarray) -> Run:
+    """The tracker and the controller of etid, with a driver that is identified from ngspice."""
+    records = list(ngspice.record(scene, 0).calibrations.recordings())
+    driver, lanes = etid.identify_driver(records), load.shape[1]
+    tracker = etid.Tracker.of(driver, records[0], electrodes=lanes, change=CHANGE)
+    controller = etid.Controller.of(tracker, current_cap=CAP, fallback=FALLBACK)
+    last, rows = np.full(lanes, np.nan), []  # charge per unit of amplitude, at the pulse before
+    loop = closed_loop(display, controller, load, WANTED)
+    for of, (state, command, amplitude) in zip(load, loop, strict=True):
+        now = display.charge[of, 0]
+        allowed = missing(now / last - 1, stderr(controller, state))
+        peak = display.peak[of] * command.amplitude
+        rows.append((display.charges(of, amplitude), peak, command.reason == "fallback", allowed))
+        last = now
+    return Run.of(rows)
 
 
-def rivals(loop: Loop) -> dict[str, Command]:
+def blind(display: Display, load: np.ndarray, command: Command) -> Run:
+    """A controller that sees charge and voltage of the last pulse, without noise."""
+    lanes = load.shape[1]
+    amplitude, rows = np.zeros((OLDER, lanes)), []
+    new = np.full(lanes, FALLBACK)
+    for pulse, of in enumerate(load):
+        amplitude = np.concatenate([new[None], amplitude[:-1]])
+        charge = display.charges(of, amplitude)
+        rows.append((charge, display.peak[of] * new, np.zeros(lanes, bool), np.zeros(lanes)))
+        new = command(pulse, new, charge, display.mean[of] * new)
+    return Run.of(rows)
+
+
+def rivals(display: Display) -> dict[str, Command]:
     """The controllers that identify nothing."""
-    nominal = WANTED / loop.typical.charge[0]  # amplitude for typical dry skin
-    held = loop.typical.mean * nominal
-    gain, model = np.full(loop.lanes, nominal / WANTED), np.zeros(loop.lanes)
+    typical = display.charge[0, 0]  # of dry skin
+    nominal = WANTED / typical
+    held = display.mean[0] * nominal
+    gain, model = np.asarray(nominal / WANTED), 0.0
 
     def voltage(_: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray) -> np.ndarray:
         return amplitude * held / v
@@ -224,12 +206,13 @@ def rivals(loop: Loop) -> dict[str, Command]:
         return amplitude * WANTED / charge if pulse == 9 else amplitude
 
     def integral(_: int, amplitude: np.ndarray, charge: np.ndarray, v: Any) -> np.ndarray:
-        return np.maximum(amplitude + GAIN * (WANTED - charge) / loop.typical.charge[0], 0.0)
+        return np.maximum(amplitude + GAIN * (WANTED - charge) / typical, 0.0)
 
     def adaptive(_: int, amplitude: np.ndarray, charge: np.ndarray, v: Any) -> np.ndarray:
-        model[:] = REFERENCE_POLE * model + (1 - REFERENCE_POLE) * WANTED
+        nonlocal gain, model
+        model = REFERENCE_POLE * model + (1 - REFERENCE_POLE) * WANTED
         normal = ADAPTATION * model / (WANTED**2 + charge**2)
-        gain[:] = np.maximum(gain - normal * (charge - model) * nominal / WANTED, 0.0)
+        gain = np.maximum(gain - normal * (charge - model) * nominal / WANTED, 0.0)
         return gain * WANTED
 
     return {

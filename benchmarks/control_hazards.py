@@ -1,6 +1,6 @@
 """The cap on the charge under hazards: loads from a short circuit to none, and wrong records.
 
-The plant is `benchmarks.control_display`. In every cell the loads change at random, between a
+The plant is `benchmarks.control_plant`. In every cell the loads change at random, between a
 short circuit, resistors, skin of all kinds, and no contact. In most cells the records are wrong as
 well, each for some pulses.
 
@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from tqdm import tqdm
 
 import etid
-from benchmarks.control_display import OLDER, Display, Load
+from benchmarks.control_plant import Display, Load, closed_loop
 from benchmarks.ladder import TWO
 from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene
@@ -175,35 +174,28 @@ class Hazards:
     def given(
         self, controller: etid.Controller, cells: Sequence[str], pulses: int
     ) -> dict[str, Given]:
-        """What the electrodes of some cells are given, side by side.
-
-        If a change of the driver is reported, all start again, as after a new calibration.
-        """
+        """What the electrodes of some cells are given, side by side."""
         tracker, display, kinds = controller.tracker, self.display, len(self.display.charge)
         lanes = tracker.electrodes // len(cells)
         of = [Cell(name, self.rng, pulses, lanes, kinds) for name in cells]
         parts = [slice(i * lanes, (i + 1) * lanes) for i in range(len(cells))]
-        load = np.zeros((pulses, tracker.electrodes), int)
-        wanted, told = np.full(tracker.electrodes, WANTED), np.zeros(tracker.electrodes)
+        load, wanted = np.hstack([cell.load for cell in of]), np.full(tracker.electrodes, WANTED)
         for cell, part in zip(of, parts, strict=True):
-            load[:, part] = cell.load
             wanted[part] *= 5 if cell.name == "more than the cap wanted" else 1
-        amplitude = np.zeros((OLDER, tracker.electrodes))
-        state, rows = tracker.start(at_rest=True), []
-        for number in tqdm(range(pulses), leave=False):
-            command = controller.command(state, charge=wanted)
-            amplitude = np.concatenate([command.amplitude[None], amplitude[:-1]])
-            v = display.windows(number, load[number], amplitude)
-            for cell, part in zip(of, parts, strict=True):
-                v[part], told[part] = cell.told(
-                    number, v[part], amplitude[:, part], tracker.adc_range
-                )
-            state = tracker.update(state, v, told)
-            charges = [display.charges(load[max(number - ago, 0)], amplitude) for ago in range(3)]
-            rows.append((*charges, command.worst, command.reason))
-            if state.driver_changed:
-                print(f"a change of the driver was reported at pulse {number}")
-                state = tracker.start()
+
+        def told(number: int, v: np.ndarray, amplitude: np.ndarray) -> tuple:
+            rows = [
+                cell.told(number, v[part], amplitude[:, part], tracker.adc_range)
+                for cell, part in zip(of, parts, strict=True)
+            ]
+            windows, amplitudes = zip(*rows, strict=True)
+            return np.concatenate(windows), np.concatenate(amplitudes)
+
+        rows = []
+        for number, pulse in enumerate(closed_loop(display, controller, load, wanted, told)):
+            earlier = (load[max(number - ago, 0)] for ago in range(3))
+            charges = [display.charges(of, pulse.amplitude) for of in earlier]
+            rows.append((*charges, pulse.command.worst, pulse.command.reason))
         whole = [np.array(column) for column in zip(*rows, strict=True)]
         return {
             cell.name: Given(*(column[:, part] for column in whole))

@@ -1,27 +1,193 @@
-"""A display under a fingertip that changes, from waveforms of ngspice.
+"""A display whose loads change at every pulse, and the loop that is closed around it.
 
-ngspice solves driver and skin from rest, with one pulse, over two periods. The circuit is linear:
-a pulse of amplitude A after one of amplitude B is A u(t) + B u(t + T). The older pulses have
-decayed to e^(-8) of the tail of the last one. Where skin changes between two pulses, the tail of
-the pulse before is that of the new skin; it is 0.3 % of the pulse.
-
-Each window has its own delay, sampling phase, noise and rounding by the converter.
+Nothing here is shared with what `etid.online` predicts. The response of each load to one pulse from
+rest comes from the circuit of the transformer at 120 000 frequencies (`by_circuit`), or from
+ngspice (`by_ngspice`). The circuit is linear: a pulse of amplitude A after pulses of amplitude B
+and C is A u(t) + B u(t + T) + C u(t + 2T). The charge is the integral of the current over the phase
+of the unloaded voltage, on a grid of 0.4 µs. Where a load changes, the tails of the pulses before
+are those of the new load.
 """
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
+import scipy.integrate
 import scipy.interpolate
-from jaxtyping import Float
+from jaxtyping import Complex, Float, Int
+from tqdm import tqdm
 
+import etid
 from benchmarks import ngspice
+from etid.online.controller import Command
+from etid.online.state import TrackerState
 from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene
-from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver
 
-OPEN = ResistorLoad(1e12)
-FINE = 16  # points per sample of the waveform that is sampled
+FINE = 12  # points per sample; a third of a sample must be whole points
+PERIODS = 6  # after which a pulse has decayed, even through a short circuit
+SOLVED = 2  # periods that ngspice solves: older pulses leave e^(-8) of the tail of the last one
+OLDER = 3  # pulses whose tails are added, the newest one included
+DELAYS = np.array([-1e-7, 0.0, 1e-7])  # [s] of the trigger, drawn for each window
+INSULATOR = ResistorLoad(1e12)  # no load, as ngspice has it
+
+Load = Callable[[Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]]
+Waves = tuple[Float[np.ndarray, " time"], Float[np.ndarray, " time"]]
+Source = Callable[[Scene, Load], Waves]
+"""Terminal voltage [V] and current [A] of one pulse from rest, `FINE` times in a sample."""
+
+
+def _points(scene: Scene, periods: int) -> int:
+    return round(periods * scene.sample_rate / scene.pulse_rate) * FINE
+
+
+@functools.lru_cache(maxsize=1)
+def _thevenin(driver: TransformerDriver, points: int, rate: float) -> tuple[np.ndarray, ...]:
+    """Frequencies [Hz], V_th and Z_th [ohm]."""
+    f = np.fft.rfftfreq(points, 1 / rate)
+    return f, driver.v_th_spectrum(f) * rate, driver.z_th(f)
+
+
+def by_circuit(scene: Scene, load: Load) -> Waves:
+    """The pulse over `PERIODS` by its spectrum."""
+    points = _points(scene, PERIODS)
+    f, v, z_th = _thevenin(scene.driver, points, scene.sample_rate * FINE)
+    z = load(f)
+    with np.errstate(invalid="ignore"):
+        through = np.where(np.isinf(z), 0.0, v / (z + z_th))
+        voltage = np.where(np.isinf(z), v, z * through)
+    return np.fft.irfft(voltage, points), np.fft.irfft(through, points)
+
+
+def by_ngspice(scene: Scene, load: Load) -> Waves:
+    """The pulse over `SOLVED` periods from its steps in time."""
+    known = INSULATOR if isinstance(load, OpenLoad) else load
+    assert isinstance(known, SkinLoad | ResistorLoad)
+    text = ngspice.single_pulse(scene.driver, known, SOLVED / scene.pulse_rate)
+    time, *waves = ngspice.solve(text)
+    grid = np.arange(_points(scene, SOLVED)) / (scene.sample_rate * FINE)
+    v, i = (scipy.interpolate.CubicSpline(time, of)(grid) for of in waves)
+    return v, i
+
+
+class Display:
+    """A display at 60 Hz and 200 kHz.
+
+    Attributes:
+        charge: Charge of a pulse of unit amplitude from rest in its own phase and in the next ones,
+            through each load [C] (load, older).
+        peak: Largest current of either sign of such a pulse through each load [A].
+        mean: Mean terminal voltage in its phase [V].
+
+    Args:
+        scene: Driver and converter.
+        loads: The loads that the electrodes may meet.
+        seed: Seed of noise and delays.
+        source: Gives the pulse through each load.
+    """
+
+    def __init__(
+        self, scene: Scene, loads: Sequence[Load], seed: int, source: Source = by_circuit
+    ) -> None:
+        self.rng = np.random.default_rng(seed)
+        rate, period = scene.sample_rate * FINE, scene.sample_rate / scene.pulse_rate
+        self.size, self.step = round(period), scene.full_scale / 2**15 / scene.scale
+        unloaded, _ = source(scene, OpenLoad())
+        points = unloaded.size
+        time, f = np.arange(points) / rate, np.fft.rfftfreq(points, 1 / rate)
+        s = 1j * f / (scene.antialias * scene.sample_rate)
+        filtered = 1 / np.prod([s**2 + 2 * np.sin(np.pi * of / 8) * s + 1 for of in (1, 3)], axis=0)
+        late = filtered * np.exp(2j * np.pi * f * DELAYS[:, None])
+
+        top, below = int(np.argmax(unloaded)), np.flatnonzero(unloaded <= 0)
+        phase = time[below[below < top].max()], time[below[below > top].min()]
+        energy = np.sum(np.fft.irfft(np.fft.rfft(unloaded) * filtered, points) ** 2) / rate
+        rms = np.sqrt(energy * scene.pulse_rate)
+        self.sigma = 0.0 if scene.snr_db is None else rms * 10 ** (-scene.snr_db / 20)
+
+        self.older = min(OLDER, round(points / FINE / period))
+        k = np.arange(self.older)
+        ends = np.array(phase)[:, None] + k / scene.pulse_rate
+        inside, first = (time > phase[0]) & (time < phase[1]), time < 1 / scene.pulse_rate
+        # Window k periods after a pulse, whose first sample is `third` thirds of a sample late.
+        begin = np.rint(k * period * FINE + np.arange(-1, 2)[:, None] * FINE / 3).astype(int)
+        at = (begin[..., None] + FINE * np.arange(self.size)) % points
+        rows, self.voltage = [], list[np.ndarray]()
+        for load in loads:
+            v, i = source(scene, load)
+            charge = scipy.integrate.cumulative_trapezoid(i, time, initial=0.0)
+            charges = np.diff(np.interp(ends, time, charge), axis=0)[0]
+            rows.append((charges, np.abs(i[first]).max(), v[inside].mean()))
+            windows = np.fft.irfft(np.fft.rfft(v) * late, points)[:, at]
+            self.voltage.append(windows.astype(np.float32))
+        self.charge, self.peak, self.mean = (np.array(of) for of in zip(*rows, strict=True))
+
+    def charges(
+        self, load: Int[np.ndarray, " lane"], amplitude: Float[np.ndarray, "older lane"]
+    ) -> Float[np.ndarray, " lane"]:
+        """Charge of a pulse at every electrode [C].
+
+        Args:
+            load: Number of the load at each electrode.
+            amplitude: Amplitudes of this pulse and of those before, the newest first.
+        """
+        return np.sum(self.charge[load].T * amplitude[: self.older], axis=0)
+
+    def windows(
+        self,
+        number: int,
+        load: Int[np.ndarray, " lane"],
+        amplitude: Float[np.ndarray, "older lane"],
+    ) -> Float[np.ndarray, "lane sample"]:
+        """What the converter records of pulse `number` [V]; the other arguments as `charges`."""
+        third = (1, 0, 2)[number % 3]  # a window begins at the sample nearest to its period
+        delay = self.rng.integers(DELAYS.size, size=load.size)
+        v = self.sigma * self.rng.standard_normal((load.size, self.size), dtype=np.float32)
+        newest = amplitude[: self.older].astype(np.float32)
+        for at in range(load.size):
+            v[at] += newest[:, at] @ self.voltage[load[at]][delay[at], third]
+        return (self.step * np.rint(v / self.step)).astype(float)
+
+
+class Pulse(NamedTuple):
+    """One pulse of a loop."""
+
+    state: TrackerState  # of the tracker before the pulse
+    command: Command  # what the controller has given
+    amplitude: Float[np.ndarray, "older lane"]  # of this pulse and of those before
+
+
+Told = Callable[[int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Windows [V] and amplitudes of a pulse as the tracker gets them, from its number and the true."""
+
+
+def closed_loop(
+    display: Display,
+    controller: etid.Controller,
+    load: Int[np.ndarray, "pulse lane"],
+    wanted: float | Float[np.ndarray, " lane"],
+    told: Told = lambda number, v, amplitude: (v, amplitude[0]),
+) -> Iterator[Pulse]:
+    """Pulses that a controller gives, which sees the records of a display.
+
+    If a change of the driver is reported, it starts again, as after a new calibration.
+    """
+    tracker, amplitude = controller.tracker, np.zeros((OLDER, load.shape[1]))
+    state = tracker.start(at_rest=True)
+    for number, of in enumerate(tqdm(load, leave=False)):
+        command = controller.command(state, charge=wanted)
+        amplitude = np.concatenate([command.amplitude[None], amplitude[:-1]])
+        yield Pulse(state, command, amplitude)
+        v, given = told(number, display.windows(number, of, amplitude), amplitude)
+        state = tracker.update(state, v, given)
+        if state.driver_changed:
+            print(f"a change of the driver was reported at pulse {number}")
+            state = tracker.start()
+
+
 # What happens to the skin at an electrode.
 KINDS = {
     "dry": "dry",
@@ -33,11 +199,17 @@ SPOTS, SPREAD = 7, 0.3  # different places of the fingertip, and the spread of t
 WETTING = 6  # pulses from dry to damp
 LIFTED, BACK = 70, 90  # pulses between which the last electrode touches nothing
 SETTLED = 2  # pulses after a change that do not count: the target begins with the third
-CORNER = 0.4  # of the sample rate, of the 4th-order Butterworth anti-alias filter
 
 
 class Fingertip:
-    """The skin at each electrode and pulse."""
+    """The skin at each electrode and pulse.
+
+    Attributes:
+        kind: What happens to the skin at each electrode.
+        loads: All skins, typical dry skin first.
+        load: Number of the skin (pulse, lane).
+        counts: Pulses that count: neither a change nor one of the two that follow it (pulse, lane).
+    """
 
     def __init__(self, electrodes: int, pulses: int) -> None:
         spots = np.exp(SPREAD * np.random.default_rng(0).standard_normal((SPOTS, 3)))
@@ -51,118 +223,16 @@ class Fingertip:
         wet = np.where(sweating, pulse / pulses / 3, wet)[..., None]  # a third of the way to damp
         # Fewer places sweat: each pulse of them is another run of ngspice.
         values = spots[at // 3 % np.where(sweating, 2, SPOTS)] * dry ** (1 - wet) * damp**wet
-        lifted = (kind == "lifted") & (pulse >= LIFTED)
-        self.loads: list[list[SkinLoad | ResistorLoad]] = [
-            [OPEN if up else SkinLoad(*map(float, of)) for up, of in zip(*row, strict=True)]
-            for row in zip(lifted & (pulse < BACK), values, strict=True)
+        up = (kind == "lifted") & (pulse >= LIFTED) & (pulse < BACK)
+        skins: list[Load] = [
+            OpenLoad() if off else SkinLoad(*map(float, of))
+            for off, of in zip(up.ravel(), values.reshape(-1, 3), strict=True)
         ]
-        # Pulses that count: neither a change nor one of the two pulses that follow it.
+        self.loads = list(dict.fromkeys([TYPICAL["dry"], *skins]))
+        number = {skin: at for at, skin in enumerate(self.loads)}
+        self.load = np.reshape([number[skin] for skin in skins], up.shape)
         changed = (pulse == 0) | (wetting & (begin <= pulse) & (pulse < begin + WETTING))
-        changed |= lifted & (pulse <= BACK)
+        changed |= (kind == "lifted") & (pulse >= LIFTED) & (pulse <= BACK)
         self.counts = ~changed
         for later in range(1, SETTLED + 1):
             self.counts[later:] &= ~changed[:-later]
-
-
-@dataclasses.dataclass(frozen=True)
-class Response:
-    """One skin, a pulse of unit amplitude: this period, and what it leaves to the next."""
-
-    # terminal voltage after the anti-alias filter [V] by time from the start [s]
-    voltage: scipy.interpolate.CubicSpline
-    charge: Float[np.ndarray, " 2"]  # charge in the phase, of the pulse and of the pulse before [C]
-    peak: float  # largest current of either sign [A]
-    mean: float  # mean terminal voltage in the phase [V]
-
-
-class Plant:
-    """Gives the windows of all electrodes, and the true charge and current.
-
-    Args:
-        scene: Driver and converter.
-        seed: Seed of noise and delays.
-        known: Responses of this driver and converter, which are added to.
-    """
-
-    def __init__(
-        self, scene: Scene, seed: int, known: dict[SkinLoad | ResistorLoad, Response]
-    ) -> None:
-        self.scene, self.rng, self.known = scene, np.random.default_rng(seed), known
-        self.period = 1 / scene.pulse_rate
-        time, v, _ = self._solved(OPEN)
-        top = int(np.argmax(v))
-        below = np.flatnonzero(v <= 0)
-        self.phase = time[below[below < top].max()], time[below[below > top].min()]
-        snr = scene.snr_db
-        rms = np.sqrt(np.trapezoid(v**2, time) / self.period)
-        self.sigma = 0.0 if snr is None else float(rms * 10 ** (-snr / 20))
-
-    def _solved(self, load: SkinLoad | ResistorLoad) -> Float[np.ndarray, "3 step"]:
-        text = ngspice.single_pulse(self.scene.driver, load, 2 * self.period)
-        return ngspice.solve(text)
-
-    def response(self, load: SkinLoad | ResistorLoad) -> Response:
-        """The waveforms of one load."""
-        if load not in self.known:
-            self.known[load] = self._response(load)
-        return self.known[load]
-
-    def _response(self, load: SkinLoad | ResistorLoad) -> Response:
-        time, v, i = self._solved(load)
-        rate = self.scene.sample_rate * FINE
-        grid = np.arange(round(2 * self.period * rate)) / rate
-        even = scipy.interpolate.CubicSpline(time, v)(grid)
-        s = 1j * np.fft.rfftfreq(grid.size, 1 / rate) / (CORNER * self.scene.sample_rate)
-        for odd in (1, 3):
-            even = np.fft.irfft(
-                np.fft.rfft(even) / (s**2 + 2 * np.sin(np.pi * odd / 8) * s + 1), grid.size
-            )
-        whole = scipy.interpolate.CubicSpline(time, i).antiderivative()
-        begin, end = self.phase
-        charge = [float(whole(end + shift) - whole(begin + shift)) for shift in (0.0, self.period)]
-        inside = (time > begin) & (time < end)
-        mean = float(np.trapezoid(v[inside], time[inside]) / (end - begin))
-        first = time < self.period
-        return Response(
-            scipy.interpolate.CubicSpline(grid, even),
-            np.array(charge),
-            float(np.abs(i[first]).max()),
-            mean,
-        )
-
-    def delivered(
-        self,
-        loads: Sequence[SkinLoad | ResistorLoad],
-        amplitude: Float[np.ndarray, " lane"],
-        before: Float[np.ndarray, " lane"],
-    ) -> tuple[Float[np.ndarray, " lane"], Float[np.ndarray, " lane"], Float[np.ndarray, " lane"]]:
-        """True charge [C], largest current [A] and mean voltage in the phase [V] of a pulse."""
-        found = [self.response(load) for load in loads]
-        charge = np.array([one.charge for one in found])
-        q = charge[:, 0] * amplitude + charge[:, 1] * before
-        peak = np.array([one.peak for one in found]) * amplitude
-        return q, peak, np.array([one.mean for one in found]) * amplitude
-
-    def windows(
-        self,
-        number: int,
-        samples: int,
-        loads: Sequence[SkinLoad | ResistorLoad],
-        amplitude: Float[np.ndarray, " lane"],
-        before: Float[np.ndarray, " lane"],
-    ) -> Float[np.ndarray, "lane sample"]:
-        """What the converter records of pulse `number` [V]; the other arguments as `delivered`."""
-        rate, scene = self.scene.sample_rate, self.scene
-        begin = round(number * self.period * rate) / rate - number * self.period
-        rows = []
-        for load, now, then in zip(loads, amplitude, before, strict=True):
-            delay = begin + scene.trigger_jitter_rms * self.rng.standard_normal()
-            at = np.arange(samples) / rate + delay
-            spline = self.response(load).voltage
-            # The end of the second period continues at its beginning in the filtered waveform.
-            v = now * spline(np.maximum(at, 0.0)) + then * spline(
-                np.minimum(at + self.period, 2 * self.period - 1 / rate)
-            )
-            rows.append(v + self.sigma * self.rng.standard_normal(samples))
-        step = scene.full_scale / 2 ** (16 - 1) / scene.scale
-        return step * np.rint(np.array(rows) / step)

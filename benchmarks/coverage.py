@@ -17,23 +17,23 @@ a load: that of a single one scatters by 1.5 % with 200 draws, and is printed wi
 import argparse
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 import etid
-from benchmarks.estimators import DEFAULT, Drivers
-from benchmarks.ladder import LOADS
+from benchmarks.estimators import DEFAULT, Drivers, found_by
+from benchmarks.ladder import LOADS, recorded
 from benchmarks.perturbed_study import drawn_driver
 from benchmarks.rates import COVERED, NORMAL_95, covered, expected_covered, expected_rms
 from benchmarks.runner import Target, at_most, option, report
 from benchmarks.spice import DATA, ESTIMATORS, FOLDER, JOINT, scene_of
+from etid.recordings.remarks import Remark
 from etid.results.verdicts import counted
 from etid.simulation.published import REFERENCE
-from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
+from etid.simulation.scenes import Scene
 
 SILENT = 5.0  # standard errors by which a successful fit may not be wrong
 TARGETS = {
@@ -62,12 +62,14 @@ OPTIONS = (
 
 
 class Draws(NamedTuple):
-    """One row per repetition: relative errors of the elements, their standard errors, verdicts."""
+    """One row per repetition."""
 
-    error: np.ndarray
-    stderr: np.ndarray
+    error: np.ndarray  # relative errors of the elements
+    stderr: np.ndarray  # their standard errors
     verdicts: np.ndarray
     cov: np.ndarray  # of the errors
+    chi2: np.ndarray
+    limited: np.ndarray  # whether a joint fit has limited the delay
 
     @classmethod
     def of(cls, rows: Sequence[tuple]) -> "Draws":
@@ -108,11 +110,10 @@ def scene(
     current_snr_db: float | None = None,
 ) -> Scene:
     """A dry and a damp fingertip behind the default transformer, and `more` trials of each."""
-    trials = [Trial(name, load) for name, load in LOADS.items()]
-    trials += [Trial(f"{MORE}/{n}{i}", load) for n, load in LOADS.items() for i in range(more)]
-    return Scene(
-        tuple(trials),
-        tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(resistors)),
+    every = LOADS | {f"{MORE}/{n}{i}": load for n, load in LOADS.items() for i in range(more)}
+    return recorded(
+        every,
+        {f"calibration/{i}": r for i, r in enumerate(resistors)},
         samples=samples,
         snr_db=snr_db,
         current_snr_db=current_snr_db,
@@ -128,18 +129,17 @@ def with_driver(of: Scene, number: int, parts: float) -> Scene:
 
 def compared(fit: etid.Fit | None, truth: Sequence[float]) -> tuple[np.ndarray, np.ndarray, str]:
     """Relative error and standard error of the elements of a fit, if there is one; its verdict."""
-    true = np.array(truth)
-    if fit is None:  # a calibration that pre-flight refuses
-        return np.full(true.size, np.nan), np.full(true.size, np.nan), "driver_failed"
-    error = np.asarray(fit.circuit.values()) / true - 1
-    return error, np.asarray(fit.stderr.values()) / true, fit.verdict
+    values, stderr, verdict = found_by(fit, len(truth))
+    return values / np.array(truth) - 1, stderr / np.array(truth), verdict
 
 
-def draw(fit: etid.Fit | None, truth: Sequence[float]) -> tuple[np.ndarray, np.ndarray, str, Any]:
-    """The same, and the covariance of the relative errors."""
+def draw(fit: etid.Fit | None, truth: Sequence[float]) -> tuple:
+    """A row of `Draws`."""
     size = len(truth)
-    cov = np.full((size, size), np.nan if fit is None else fit.cov / np.outer(truth, truth))
-    return *compared(fit, truth), cov
+    if fit is None:
+        return *compared(fit, truth), np.full((size, size), np.nan), np.nan, False
+    limited = bool(int(fit.remarks) & Remark.small_delays)
+    return *compared(fit, truth), fit.cov / np.outer(truth, truth), float(fit.chi2), limited
 
 
 def monte_carlo(
@@ -158,19 +158,26 @@ def monte_carlo(
         parts: Standard deviation of the logarithm of every part of the drivers.
         drivers: Those that other methods have identified from the same draws.
     """
-    counted = [trial.path for trial in scene.trials if not trial.path.startswith(MORE)]
-    truth = {path: list(scene.truth()[path].values()) for path in counted}
-    studies = (
-        with_driver(scene, seed, parts).simulate(seed=seed)
-        for seed in tqdm(range(repetitions), disable=None)
-    )
+    every = {trial.path: list(scene.truth()[trial.path].values()) for trial in scene.trials}
+    truth = {path: values for path, values in every.items() if not path.startswith(MORE)}
+    studies = (with_driver(scene, s, parts).simulate(seed=s) for s in range(repetitions))
+    return identified(studies, truth, method, drivers)
+
+
+def identified(
+    studies: Iterable[etid.Study],
+    truth: Mapping[str, Sequence[float]],
+    method: str | None = None,
+    drivers: Drivers | None = None,
+) -> dict[str, Draws]:
+    """Identify the recordings of studies whose elements are known by their paths."""
+    every, known, paths = list(studies), drivers or Drivers(), list(truth)
     if method == JOINT:
-        rows = [_jointly(study, counted) for study in studies]
-    elif scene.calibration:
-        known = Drivers() if drivers is None else drivers
-        rows = [_behind_driver(study, counted, method, known) for study in studies]
+        rows = [_jointly(study, paths) for study in tqdm(every, disable=None)]
+    elif every[0].calibrations:
+        rows = [_behind_driver(study, paths, method, known) for study in tqdm(every, disable=None)]
     else:
-        rows = _from_current(list(studies), counted, method)
+        rows = _from_current(every, paths, method)
     return {
         path: Draws.of([draw(row.get(path), true) for row in rows]) for path, true in truth.items()
     }
@@ -218,9 +225,10 @@ def lines(name: str, of: Draws, bounds: dict[str, float]) -> Iterator[str]:
                 f"{np.abs(of.z[:, i]).max():9.1f}"
             )
         covered, rms = expected_covered(good.sum()), expected_rms(good.sum())
+        limited = f"; delays limited in {of.limited.mean():.0%}" if of.limited.any() else ""
         yield (
             f"{name:<10}expected: covered {covered[0]:.3f} to {covered[1]:.3f}, "
-            f"rms z {rms[0]:.2f} to {rms[1]:.2f}"
+            f"rms z {rms[0]:.2f} to {rms[1]:.2f}{limited}"
         )
 
 

@@ -1,12 +1,12 @@
-"""Cost against the number of samples, of lanes and of workers; a table and a figure.
+"""Cost against the number of samples and of lanes; a table and a figure. `scale` has the workers.
 
-What has no workers runs on one core, as `speed` does. A slope is that of the straight line
+All runs on one core, as in `speed`. A slope is that of the straight line
 between two neighbours on logarithmic axes: 1 where cost is in proportion, 0 where it is constant.
 """
 
 import argparse
+import itertools
 import pathlib
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -16,31 +16,24 @@ import numpy as np
 import scipy.signal
 
 import etid
-from benchmarks import charts, peers, scale
-from benchmarks.large_file import large_file
-from benchmarks.problem import START, Problem, harmonics, problem, problem_of, terms
-from benchmarks.provenance import write_csv
+from benchmarks import charts, peers
+from benchmarks.machine import median_time, write_csv
+from benchmarks.peers import START, Problem, harmonics, problem, problem_of, terms
 from benchmarks.runner import QUICK, option
-from benchmarks.timing import median_time, pin
 from etid.estimators.maximum_likelihood.search import WELL
-from etid.signals.filtering import lfilter
-from etid.solvers.levenberg_marquardt import normal_equations
 
+PINNED = True
 OPTIONS = (QUICK, option("--folder", default=pathlib.Path(), type=pathlib.Path))
 SAMPLES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 LANES = (1, 4, 16, 64, 256, 1_024, 10_000, 100_000)
-WORKERS = (1, 2)
 LIMIT = 20.0  # [s] of one call; longer ones end their curve
 ENOUGH = 0.5  # [s] of calls of which the median is taken
 PERIODS = 3
 PULSE_RATE = 60.0  # [Hz]
 NOISE = 1e-3  # of the effective value
-BENT = 0.25  # change of slope that is marked in the table
-RECORDINGS = 2_000  # for the workers
 AXES = {
     "samples": ("samples of a record", "seconds per record"),
     "lanes": ("recordings in a batch", "seconds per recording"),
-    "workers": ("worker processes", "seconds per recording of a file"),
 }
 
 Row = dict[str, Any]
@@ -60,20 +53,10 @@ def seconds(call: Callable[[], Any]) -> float:
 def calls(one: Problem) -> dict[str, Callable[[], Any]]:
     """What is measured against the number of samples, of a single record."""
     first = jax.tree.map(lambda leaf: leaf[0], one.lanes)
-    b, a, start, v = map(jnp.asarray, (peers.B, peers.A, START, one.records[0].v_th))
-    forward = jax.jit(lambda b, v: lfilter(b, a, v)[0])
-    gradient = jax.jit(jax.grad(lambda b, v: jnp.sum(lfilter(b, a, v)[0] ** 2)))
-
-    def three(q, v):
-        return lfilter(b, a.at[1:4].add(q), v)[0]
-
-    equations = jax.jit(lambda q, v: normal_equations(three, q, v))
+    start = jnp.asarray(START)
     harmonic = jax.jit(lambda q, first: WELL.equations(terms, q, one.load(first)))
     refine = jax.jit(peers.one_fit(one)["ours"])
-    return {
-        "filter": lambda: forward(b, v),
-        "gradient of the filter": lambda: gradient(b, v),
-        "normal equations of the filter": lambda: equations(jnp.zeros(3), v),
+    return peers.filter_calls(one.records[0].v_th) | {
         "harmonics and noise": lambda: harmonics(one.records[0]),
         "normal equations of the harmonics": lambda: harmonic(start, first),
         "LM fit on the harmonics": lambda: refine(first),
@@ -131,33 +114,21 @@ def against_lanes(counts: Sequence[int]) -> Iterator[Row]:
             yield _row("lanes", name, count, each)
 
 
-def against_workers(folder: pathlib.Path, recordings: int) -> Iterator[Row]:
-    """Seconds per recording of a file, by processes with a core each."""
-    plan = scale.Plan(folder, recordings, max(1, recordings // 16), (), None)
-    large_file(folder, recordings, "contiguous")
-    for method in (None, "equation_error"):
-        for workers in WORKERS:
-            found = scale.measured(folder, scale.fit_job(plan, "contiguous", method, workers))
-            each = found["seconds"] / recordings
-            yield _row("workers", method or "maximum_likelihood", workers, each)
-
-
 def with_slopes(rows: Iterable[Row]) -> Iterator[Row]:
     """The same with the slope from the row before of the same curve, NaN at its begin."""
     before: dict[tuple[str, str], Row] = {}
     for row in rows:
-        last, slope, bent = before.get((row["against"], row["what"])), np.nan, False
+        last, slope = before.get((row["against"], row["what"])), np.nan
         if last is not None:
             run = np.log(row["number"] / last["number"])
             slope = float(np.log(row["seconds"] / last["seconds"]) / run)
-            bent = bool(abs(slope - last["slope"]) > BENT)
-        before[row["against"], row["what"]] = row = {**row, "slope": slope, "bent": bent}
-        yield row
+        before[row["against"], row["what"]] = row
+        yield {**row, "slope": slope}
 
 
 def draw(rows: Sequence[Row], path: pathlib.Path) -> None:
     """One panel per number, legible without colours."""
-    figure, panels = charts.new_figure(1, 3, (11.0, 4.2))
+    figure, panels = charts.new_figure(1, len(AXES), (9.0, 4.2))
     for axes, (against, (across, up)) in zip(panels[0], AXES.items(), strict=True):
         of = [row for row in rows if row["against"] == against]
         for style, name in enumerate(dict.fromkeys(row["what"] for row in of)):
@@ -166,31 +137,21 @@ def draw(rows: Sequence[Row], path: pathlib.Path) -> None:
                 *zip(*curve, strict=True), color=charts.INK, linestyle=charts.DASHES[style],
                 marker=charts.MARKS[style], markersize=4, linewidth=1, label=name,
             )  # fmt: skip
-        if against == "workers":
-            axes.set_xticks(WORKERS, labels=map(str, WORKERS), minor=False)
-            axes.minorticks_off()
         axes.set(xlabel=across, ylabel=up)
         axes.legend(fontsize=7, frameon=False)
     charts.save(figure, path)
 
 
-def _all(quick: bool) -> Iterator[Row]:
-    # Workers come first: once this process has a core, its children have no other.
-    with tempfile.TemporaryDirectory() as files:
-        yield from against_workers(pathlib.Path(files), 64 if quick else RECORDINGS)
-    pin()
-    yield from against_samples(SAMPLES[:3] if quick else SAMPLES)
-    yield from against_lanes(LANES[:3] if quick else LANES)
-
-
 def main(arguments: argparse.Namespace) -> bool:
     """Measure, print, and write `curves.csv` and `curves.svg`."""
-    table = []
-    for row in with_slopes(_all(arguments.quick)):
+    table, few = [], slice(3 if arguments.quick else None)
+    for row in with_slopes(
+        itertools.chain(against_samples(SAMPLES[few]), against_lanes(LANES[few]))
+    ):
         table.append(row)
         print(
             f"{row['against']:<9}{row['what']:<36}{row['number']:>9}{1e3 * row['seconds']:12.4f} ms"
-            f"  slope {row['slope']:.2f}{'  bends' if row['bent'] else ''}",
+            f"  slope {row['slope']:.2f}",
             flush=True,
         )
     write_csv(arguments.folder / "curves.csv", table)

@@ -12,10 +12,8 @@ import numpy as np
 import scipy.optimize
 
 import etid
-from benchmarks.ladder import LOADS
-from etid.simulation.published import REFERENCE
-from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, TransformerDriver
+from benchmarks.ladder import LOADS, recorded
+from etid.simulation.transformer import TransformerDriver
 
 OPTIONS = ()
 DUTY = 0.04  # the paper's
@@ -29,14 +27,9 @@ def error(pulse_rate: float, load: str) -> dict[str, float]:
     pulse = dataclasses.replace(
         TransformerDriver(), width=DUTY / pulse_rate, lead_in=min(120e-6, 0.2 / pulse_rate)
     )
-    made = Scene(
-        (Trial(load, LOADS[load]),),
-        (Trial("calibration", ResistorLoad(REFERENCE)),),
-        pulse,
-        pulse_rate=pulse_rate,
-        samples=round(DURATION * 200e3),
-        bits=None,
-    )
+    samples = round(DURATION * 200e3)
+    settings = {"driver": pulse, "pulse_rate": pulse_rate, "samples": samples, "bits": None}
+    made = recorded({load: LOADS[load]}, **settings)
     # The same noise in volts for all: signal-to-noise is relative to the effective value.
     effective = np.sqrt(2 * np.sum(np.abs(made.waveform().v_th) ** 2))
     made = dataclasses.replace(made, snr_db=float(20 * np.log10(effective / NOISE)))

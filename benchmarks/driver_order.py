@@ -16,21 +16,21 @@ four poles at 60 dB, and five without noise.
 import argparse
 import collections
 import pathlib
-import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from tqdm import tqdm
 
 import etid
-from benchmarks.coverage import compared, scene, with_driver
+from benchmarks.coverage import identified, scene, with_driver
+from benchmarks.estimators import Drivers
 from benchmarks.perturbed_study import PARTS
 from benchmarks.rates import NORMAL_95
 from benchmarks.runner import Target, at_least, option, report
-from benchmarks.spice import DATA, FOLDER
+from benchmarks.spice import DATA, FOLDER, imported
 from etid.results.tried_orders import AUTO, Order
+from etid.simulation.scenes import Scene
 
 AS_GOOD = 1.1  # of 20 drivers with two skins, a root mean square is known to about 10 %
 NEAR = 0.5  # bounds
@@ -53,83 +53,73 @@ OPTIONS = (
 )
 
 
-class Draw(NamedTuple):
-    """The fits behind one driver of a drawn scene."""
+class Found(NamedTuple):
+    """The fits behind drivers of one order."""
 
-    order: int  # poles of this driver
-    error: Float[np.ndarray, "trial element"]  # errors of the elements in units of their bounds
-    z: Float[np.ndarray, "trial element"]  # the same in units of the standard errors
+    order: np.ndarray  # poles of each driver
+    error: Float[np.ndarray, "driver trial element"]  # errors of the elements in their bounds
+    z: Float[np.ndarray, "driver trial element"]  # the same in standard errors
 
-
-def draw(seed: int, snr_db: float, orders: Sequence[Order], samples: int) -> dict[Order, Draw]:
-    """Fits of one drawn scene by orders of the driver.
-
-    Args:
-        seed: Of driver, noise and delays.
-        snr_db: Of every record [dB].
-        orders: Orders to identify the driver with.
-        samples: Length of a record [samples].
-    """
-    drawn = with_driver(scene(snr_db, samples), seed, PARTS)
-    study, bounds, truth, found = drawn.simulate(seed), etid.bound(drawn), drawn.truth(), {}
-    for order in orders:
-        calibrations = list(study.calibrations.recordings())
-        driver, rows = etid.identify_driver(calibrations, order=order, throw=False), []
-        for path in (trial.path for trial in drawn.trials):
-            fit = etid.identify_skin(study[path], driver, throw=False)
-            error, stderr, _ = compared(fit, list(truth[path].values()))
-            rows.append((error / list(bounds[path].relative.values()), error / stderr))
-        found[order] = Draw(driver.order, *map(np.array, zip(*rows, strict=True)))
-    return found
+    @property
+    def rms(self) -> float:
+        """Root mean square of the errors; infinite if one is no number."""
+        square = np.mean(self.error**2)
+        return float(np.sqrt(square)) if np.isfinite(square) else np.inf
 
 
-def rms(draws: Sequence[dict[Order, Draw]], order: Order) -> float:
-    """Root mean square of the errors in units of the bound; infinite if an error is no number."""
-    squares = np.mean([one[order].error ** 2 for one in draws])
-    return float(np.sqrt(squares)) if np.isfinite(squares) else np.inf
+def found_with(order: Order, drawn: Sequence[Scene]) -> Found:
+    """Fits of drawn scenes, one recording of each trial, by drivers of an order."""
+    drivers, truth, bounds = Drivers(order), drawn[0].truth(), [etid.bound(of) for of in drawn]
+    studies = [of.simulate(seed) for seed, of in enumerate(drawn)]
+    paths = {of.path: list(truth[of.path].values()) for of in drawn[0].trials}
+    every = identified(studies, paths, drivers=drivers)
+    limits = {p: np.array([list(of[p].relative.values()) for of in bounds]) for p in every}
+    return Found(
+        np.array([0 if one is None else one.order for one in drivers.known.values()]),
+        np.stack([of.error / limits[path] for path, of in every.items()], axis=1),
+        np.stack([of.error / of.stderr for of in every.values()], axis=1),
+    )
 
 
-def right(draws: Sequence[dict[Order, Draw]], orders: Sequence[int]) -> list[bool]:
+def right(found: Mapping[Order, Found]) -> np.ndarray:
     """Whether each choice is the best fixed order, or as good."""
-    errors = {order: rms(draws, order) for order in orders}
-    best = min(orders, key=lambda order: errors[order])
-    good = [errors.get(one[AUTO].order, np.inf) <= AS_GOOD * errors[best] for one in draws]
-    apart = [np.sqrt(np.mean((one[AUTO].error - one[best].error) ** 2)) for one in draws]
-    return [by_order or off <= NEAR for by_order, off in zip(good, apart, strict=True)]
+    chosen = found[AUTO]
+    errors = {order: of.rms for order, of in found.items() if order != AUTO}
+    best = min(errors, key=lambda order: errors[order])
+    as_good = [errors.get(int(order), np.inf) <= AS_GOOD * errors[best] for order in chosen.order]
+    apart = np.sqrt(np.mean((chosen.error - found[best].error) ** 2, axis=(1, 2)))
+    return np.asarray(as_good) | (apart <= NEAR)
 
 
 def spice_orders(folder: pathlib.Path, names: Iterable[str]) -> dict[str, int]:
     """The orders chosen for the calibrations of SPICE recordings, by name."""
     found = {}
     for name in names:
-        with tempfile.TemporaryDirectory() as work:
-            file = pathlib.Path(work, "study.h5")
-            etid.import_file(folder / f"{name}.npz", file)
-            with etid.read(file) as study:
-                calibrations = list(study.calibrations.recordings())
-                found[name] = etid.identify_driver(calibrations, order=AUTO, throw=False).order
+        with imported(folder / f"{name}.npz") as study:
+            calibrations = list(study.calibrations.recordings())
+            found[name] = etid.identify_driver(calibrations, order=AUTO, throw=False).order
     return found
 
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table; whether enough choices are right."""
-    orders, verdicts = tuple(arguments.orders), list[bool]()
+    verdicts = list[bool]()
     for snr_db in arguments.snr_db:
-        draws = [
-            draw(seed, snr_db, (AUTO, *orders), arguments.samples)
-            for seed in tqdm(range(arguments.drivers), disable=None)
-        ]
-        good = right(draws, orders)
-        covered = np.mean([np.abs(one[AUTO].z) < NORMAL_95 for one in draws])
-        errors = ", ".join(f"{order} {rms(draws, order):.2f}" for order in (AUTO, *orders))
-        chosen = collections.Counter(one[AUTO].order for one in draws)
-        counts = ", ".join(f"{count} of order {order}" for order, count in sorted(chosen.items()))
+        usual = scene(snr_db, arguments.samples)
+        drawn = [with_driver(usual, seed, PARTS) for seed in range(arguments.drivers)]
+        tried: list[Order] = [AUTO, *arguments.orders]
+        by_order: dict[Order, Found] = {order: found_with(order, drawn) for order in tried}
+        good, chosen = right(by_order), by_order[AUTO]
+        errors = ", ".join(f"{order} {of.rms:.2f}" for order, of in by_order.items())
+        counts = collections.Counter(chosen.order.tolist())
+        orders = ", ".join(f"{count} of order {order}" for order, count in sorted(counts.items()))
         print(
-            f"{snr_db:g} dB: error in bounds: {errors}; {100 * covered:.1f} % covered, "
-            f"{100 * np.mean(good):.0f} % right, {counts}",
+            f"{snr_db:g} dB: error in bounds: {errors}; "
+            f"{100 * np.mean(np.abs(chosen.z) < NORMAL_95):.1f} % covered, "
+            f"{100 * np.mean(good):.0f} % right, {orders}",
             flush=True,
         )
-        verdicts += good
+        verdicts += good.tolist()
     found = {"right choices": float(np.mean(verdicts))}
     folder = arguments.data / FOLDER
     if folder.exists():

@@ -21,10 +21,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import etid
-from etid.circuits.circuit import SkinRC
+from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.registry import named, names
 from etid.identify.options import for_calibrations
 from etid.recordings.preflight import Inspected
+from etid.results.tried_orders import Order
 
 DEFAULT = "default"
 OURS = (DEFAULT, *names())
@@ -106,8 +107,8 @@ class Answer:
 class Drivers:
     """Drivers from calibrations; each is identified once for all methods that use the same."""
 
-    def __init__(self, order: int = 5):
-        self.order = order
+    def __init__(self, order: Order = 5):
+        self.order: Order = order
         self.known: dict[tuple, etid.Driver | None] = {}
         self.times: dict[str | None, list[float]] = {}
 
@@ -138,7 +139,7 @@ def shared(method: str | None) -> str | None:
 
 
 def driver_of(
-    calibrations: etid.Recording | Sequence[etid.Recording], method: str | None, order: int = 5
+    calibrations: etid.Recording | Sequence[etid.Recording], method: str | None, order: Order = 5
 ) -> etid.Driver | None:
     """The driver, whatever its verdict; None if pre-flight refuses a calibration."""
     try:
@@ -150,3 +151,23 @@ def driver_of(
 def method_of(name: str) -> str | None:
     """A method as `identify_skin` takes it."""
     return None if name == DEFAULT else name
+
+
+def fits(
+    records: Sequence[etid.Recording],
+    driver: etid.Driver | None,
+    name: str,
+    circuit: AbstractCircuit | None = None,
+) -> list[etid.Fit | None]:
+    """What a method makes of recordings behind one driver; nothing without a driver."""
+    if driver is None:
+        return [None] * len(records)
+    found = etid.identify_skins(records, driver, method=method_of(name), circuit=circuit)
+    return [found[number] for number in range(len(found))]
+
+
+def found_by(fit: etid.Fit | None, size: int = len(ELEMENTS)) -> tuple[Elements, Elements, str]:
+    """Elements, standard errors and verdict of a fit; without one its driver failed."""
+    if fit is None:
+        return np.full(size, np.nan), np.full(size, np.nan), "driver_failed"
+    return np.asarray(fit.circuit.values()), np.asarray(fit.stderr.values()), fit.verdict

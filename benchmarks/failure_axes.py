@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Complex, Float
 
-from benchmarks.ladder import LOADS, rung
+from benchmarks.ladder import LOADS, recorded
 from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.recordings.recording import Recording, Samples
-from etid.simulation.scenes import Scene, Trial
+from etid.simulation.scenes import Scene
 from etid.simulation.transformer import SkinLoad, TransformerDriver
 
 SNR_DB = (20, 30, 40, 60, 80)
@@ -188,10 +188,8 @@ COLOURS = {
 def scene(loads: Callable[[SkinLoad], Callable] = lambda skin: skin, **settings) -> Scene:
     """Trials with dry and damp skin by turns; `settings` as `Scene` takes them."""
     kinds = [(name, loads(skin)) for name, skin in LOADS.items()]
-    trials = tuple(
-        Trial(f"{name}/{number:02d}", load) for number in range(MOST) for name, load in kinds
-    )
-    return dataclasses.replace(rung("dry", **settings), trials=trials)
+    every = {f"{name}/{number:02d}": load for number in range(MOST) for name, load in kinds}
+    return recorded(every, **settings)
 
 
 MOST = 5  # trials of each kind

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array
 
 import etid
-from benchmarks.estimators import DEFAULT, NOTHING, Answer, Drivers, method_of
+from benchmarks.estimators import DEFAULT, NOTHING, Answer, Drivers, fits
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
-from benchmarks.mappings import make_room
+from benchmarks.machine import make_room
 from benchmarks.selection_draws import choices
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
 from etid.estimators.registry import named
@@ -141,13 +141,13 @@ def said(
         return
     discrete = isinstance(driver, DiscreteDriver) and not bool(is_stable(driver.a))
     if name == AUTO:
-        fits: Any = [one.fit for one in choices(records, driver)]
+        found: Any = [one.fit for one in choices(records, driver)]
     else:
-        fits = etid.identify_skins(records, driver, method=method_of(name), circuit=cell.circuit)
-    for number, path in enumerate(record.path for record in records):
-        words = fits[number].verdict, driver.verdict
+        found = fits(records, driver, name, cell.circuit)
+    for path, fit in zip((record.path for record in records), found, strict=True):
+        words = fit.verdict, driver.verdict
         yield dataclasses.replace(
-            judged(cell, name, seed, path, fits[number], bound[path]),
+            judged(cell, name, seed, path, fit, bound[path]),
             unstable=discrete or "unstable" in words,
             unsettled=any(word in NOT_CONVERGED for word in words),
         )

@@ -28,12 +28,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from benchmarks import failure_chart
+from benchmarks import charts
 from benchmarks.estimators import DEFAULT, ELEMENTS, OURS, Answer
 from benchmarks.failure_axes import MOST, Cell, cells
 from benchmarks.failure_draws import Effort, answers
-from benchmarks.provenance import write_csv
+from benchmarks.machine import write_csv
 from benchmarks.rates import rate
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, tabled
 
@@ -47,6 +48,11 @@ ALL = 2 * MOST  # trials of a driver
 DRIVERS = 3  # an hour on two cores
 USUAL = 10_000.0  # samples of three periods at 200 kHz
 CHUNK = 8  # cells of one task
+COLUMNS = 4  # of a picture
+PANEL = (3.9, 2.5)  # [inch]
+MARK = "▲"  # of silent failures
+DARK = 0.55  # rate above which print is white
+BOUND = "largest bound of an element, %"  # which no method can be better than
 # Of the quick run: two where all is well for the default method and not for the others, and one
 # where another skin has to be noticed.
 FEW = {
@@ -55,6 +61,8 @@ FEW = {
     ("SNR and skin that is not one RC", "60 dB", "Cole, 0.9"),
 }
 RANKING = (DEFAULT, "steiglitz_mcbride")  # what is right at least as often as what follows it
+
+Rows = Sequence[Mapping[str, Any]]
 
 OPTIONS = (
     QUICK,
@@ -196,6 +204,51 @@ def in_order(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: MAPS.index(row["map"]))
 
 
+def _panel(axes: Axes, rows: Rows, down: list[str], across: list[str], title: str) -> None:
+    """One method: failures in grey and in numbers, silent ones with a mark; or the bounds."""
+    shades = np.full((len(down), len(across)), 0.0 if title == BOUND else np.nan)
+    for row in rows:
+        i, j = down.index(row["row"]), across.index(row["column"])
+        if title == BOUND:
+            texts = [(0.0, f"{100 * row['largest_bound']:.2g}", 7, "normal")]
+        else:
+            shades[i, j] = failed = row["wrong"] + row["refused"]
+            silent = row["silent"] > 0
+            texts = [(-0.22 * silent, f"{100 * failed:.0f}", 8, "normal")]
+            if silent:
+                digits = 0 if row["silent"] > 0.01 else 1
+                texts.append((0.24, f"{MARK} {100 * row['silent']:.{digits}f}", 7, "bold"))
+        for lower, text, size, weight in texts:
+            axes.text(j, i + lower, text, ha="center", va="center", fontsize=size, weight=weight,
+                      color="white" if shades[i, j] > DARK else charts.INK)  # fmt: skip
+    axes.imshow(shades, cmap="Greys", vmin=0, vmax=1, aspect="auto")
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0, labelsize=7)
+    axes.set_xticks(range(len(across)), across)
+    axes.set_yticks(range(len(down)), down)
+    axes.set_title(title, fontsize=9)
+
+
+def draw(rows: Rows, path: pathlib.Path) -> None:
+    """Draw one map from its rows of the table, as SVG or PNG."""
+    methods, down, across = (
+        list(dict.fromkeys(row[name] for row in rows)) for name in ("method", "row", "column")
+    )
+    high = -(-(len(methods) + 1) // COLUMNS)
+    size = COLUMNS * PANEL[0], high * PANEL[1] + 0.8
+    figure, axes = charts.new_figure(high, COLUMNS, size, sharey=True)
+    panels, of = list(axes.flat), {m: [row for row in rows if row["method"] == m] for m in methods}
+    for panel, method in zip(panels, methods, strict=False):
+        _panel(panel, of[method], down, across, method.replace("_", " "))
+    _panel(panels[len(methods)], of[methods[0]], down, across, BOUND)
+    for panel in panels[len(methods) + 1 :]:
+        panel.set_visible(False)
+    title = f"{rows[0]['map']}: % of answers that are wrong or refused; {MARK} % that are wrong"
+    figure.suptitle(f"{title} silently", fontsize=11)
+    charts.save(figure, path)
+
+
 def main(arguments: argparse.Namespace) -> bool:
     """Draw, count, print, and write tables and pictures."""
     quick, only, folder = arguments.quick, arguments.only, arguments.folder
@@ -221,7 +274,7 @@ def main(arguments: argparse.Namespace) -> bool:
     write_csv(folder / SILENT, in_order([*kept[SILENT], *failures]))
     for name in dict.fromkeys(row["map"] for row in rows):
         of = [row for row in rows if row["map"] == name]
-        failure_chart.draw(of, folder / f"failures_{MAPS.index(name) + 1}.svg")
+        draw(of, folder / f"failures_{MAPS.index(name) + 1}.svg")
     every = [answer for _, answered in found for answer in answered]
     print("\n".join(summary(every)))
     for row in failures:

@@ -11,21 +11,21 @@ import collections
 import faulthandler
 import json
 import math
+import multiprocessing
 import os
 import pathlib
 import resource
-import select
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 import traceback
 import warnings
 from collections.abc import Iterator
+from multiprocessing.connection import Connection
 from typing import Any
 
+import jax
 import numpy as np
 
 import etid
@@ -39,6 +39,7 @@ START = 120.0  # seconds until a child has made its good files, or damaged one
 SHARES = {"recordings": 8, "fits": 5, "mapping": 2, "csv": 1, "npz": 1, "matlab": 2,
           "matlab5": 1, "tdms": 1, "abf": 1}  # fmt: skip
 FINE = ("read", "refused")
+CONTEXT = multiprocessing.get_context("spawn")
 
 
 OPTIONS = (
@@ -100,62 +101,52 @@ class _Child:
     """A process that reads one damaged file after the other."""
 
     def __enter__(self) -> "_Child":
-        self.folder = tempfile.mkdtemp(prefix="etid-fuzz-")
-        self.errors = tempfile.TemporaryFile("w+")
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.fuzz", self.folder],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.errors, bufsize=0,
-        )  # fmt: skip
-        self.pending = b""
-        self.alive = self._answer(START) is not None
-        if not self.alive:
+        self.folder = pathlib.Path(tempfile.mkdtemp(prefix="etid-fuzz-"))
+        self.log, (self.pipe, theirs) = self.folder.with_suffix(".log"), CONTEXT.Pipe()
+        self.process = CONTEXT.Process(target=child, args=(theirs, self.folder, self.log))
+        self.process.start()
+        theirs.close()
+        self.alive = True
+        if self._answer(START) is None:
             raise RuntimeError(f"no child process could be started:\n{self._last_words()}")
         return self
 
     def __exit__(self, *_: object) -> None:
         self.process.kill()
-        self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            pipe.close()
-        self.errors.close()
+        self.process.join()
+        self.pipe.close()
+        self.log.unlink(missing_ok=True)
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def outcome(self, kind: str, seed: int, limit: float) -> dict[str, Any]:
         """What comes of one file."""
         found = {"kind": kind, "seed": seed, "seconds": limit, "memory": 0.0, "detail": ""}
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps([kind, seed]).encode() + b"\n")
+        self.pipe.send((kind, seed))
         # What a file that has once been damaged takes to be damaged is not the reader's time.
         began = self._answer(PATIENCE * START, START) is not None
         answer = self._answer(PATIENCE * limit, limit) if began else None
         if answer is not None:
             return found | answer
-        self.alive = False
-        hangs = self.process.poll() is None
-        if hangs:
-            self.process.send_signal(signal.SIGUSR1)  # faulthandler says where it is
+        hangs, pid, self.alive = self.alive, self.process.pid, False
+        if hangs and pid is not None:
+            os.kill(pid, signal.SIGUSR1)  # faulthandler says where it is
             time.sleep(0.3)
             self.process.kill()
-        status = self.process.wait()
-        outcome = "hang" if hangs else f"crash, status {status}"
+        self.process.join()
+        outcome = "hang" if hangs else f"crash, status {self.process.exitcode}"
         return found | {"outcome": outcome, "detail": self._last_words()}
 
     def _answer(self, limit: float, work: float = math.inf) -> dict[str, Any] | None:
-        """The next line; None if there is none in this time, or in this time of the processor."""
-        assert self.process.stdout is not None
+        """The next one; None if there is none in this time, or in this time of the processor."""
         end, begun = time.monotonic() + limit, self._worked()
-        while b"\n" not in self.pending:
-            if not select.select([self.process.stdout], [], [], 0.2)[0]:
-                if time.monotonic() < end and self._worked() - begun < work:
-                    continue
-                return None
-            more = self.process.stdout.read(1 << 16)
-            if not more:
-                return None
-            self.pending += more
-        line, _, self.pending = self.pending.partition(b"\n")
-        return json.loads(line)
+        try:
+            while not self.pipe.poll(0.2):
+                if time.monotonic() > end or self._worked() - begun > work:
+                    return None
+            return self.pipe.recv()
+        except (EOFError, ConnectionError):  # it has died
+            self.alive = False
+            return None
 
     def _worked(self) -> float:
         """Seconds of the processor that the child has had."""
@@ -163,8 +154,7 @@ class _Child:
         return sum(map(int, stat.rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
 
     def _last_words(self) -> str:
-        self.errors.seek(0)
-        return self.errors.read()[-4000:]
+        return self.log.read_text(errors="replace")[-4000:] if self.log.exists() else ""
 
 
 def damage(path: pathlib.Path, kind: specimens.Kind, seed: int) -> pathlib.Path:
@@ -205,25 +195,24 @@ def _status(name: str) -> int:
     return 1024 * int(text.split(f"{name}:")[1].split()[0])
 
 
-def child(folder: pathlib.Path) -> None:
-    """Read cases from stdin, and write what comes of them to stdout."""
+def child(pipe: Connection, folder: pathlib.Path, log: pathlib.Path) -> None:
+    """Take cases from a pipe, and give what comes of them."""
+    with log.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    jax.config.update("jax_enable_x64", True)
     faulthandler.register(signal.SIGUSR1, all_threads=True)
     faulthandler.enable()
     warnings.simplefilter("error")
     known = specimens.kinds()
-    out = sys.stdout
-    sys.stdout = sys.stderr
     limit = _status("VmSize") + SAFETY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
-    def say(**content: Any) -> None:
-        print(json.dumps(content), file=out, flush=True)
-
-    say()
+    pipe.send({})
     warm: set[str] = set()
-    for line in sys.stdin:
-        name, seed = json.loads(line)
+    while True:
+        name, seed = pipe.recv()
         kind = known[name]
         if name not in warm and seed % specimens.PAGES == 0:  # what it compiles is kept
             good = folder / f"good{kind.suffix}"
@@ -231,7 +220,7 @@ def child(folder: pathlib.Path) -> None:
             judge(good, kind, seed)
             warm.add(name)
         path = damage(folder, kind, seed)
-        say()
+        pipe.send({})
         pathlib.Path("/proc/self/clear_refs").write_text("5", "ascii")  # the peak from here on
         started = time.process_time()
         outcome, detail = judge(path, kind, seed)
@@ -241,11 +230,5 @@ def child(folder: pathlib.Path) -> None:
         memory = _status("VmHWM")
         if memory > MEMORY and outcome in FINE:
             outcome, detail = "memory", f"{memory >> 20} MB. {detail}"
-        say(outcome=outcome, detail=detail, seconds=seconds, memory=memory)
-
-
-if __name__ == "__main__":
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    child(pathlib.Path(sys.argv[1]))
+        said = {"outcome": outcome, "detail": detail, "seconds": seconds, "memory": memory}
+        pipe.send(said)

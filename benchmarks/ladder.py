@@ -8,10 +8,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from benchmarks import ngspice
+from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.study import Study
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
+from etid.simulation.transformer import Impedance, ResistorLoad
 
 LOADS = TYPICAL
 START = (20e3, 100e3, 0.3e-9)  # elements, in SI, of no fingertip in particular
@@ -28,14 +29,23 @@ SOURCES: Mapping[str, Callable[[Scene, int], Study]] = {
 JITTER = {"no delays": 0.0, "delays of 500 ns": 500e-9}
 
 
-def rung(load: str, **settings: Any) -> Scene:
-    """One scene; `settings` as `Scene` takes them, in place of those of the middle rung."""
+def recorded(
+    loads: Mapping[str, Impedance | AbstractCircuit],
+    resistors: Mapping[str, float] = {CALIBRATION: REFERENCE},
+    **settings: Any,
+) -> Scene:
+    """Loads and calibrations by path; `settings` of `Scene` in place of the middle rung's."""
     middle = {"snr_db": 60.0, "samples": 10_000, "trigger_jitter_rms": 50e-9}
     return Scene(
-        (Trial(TRIAL, LOADS[load]),),
-        (Trial(CALIBRATION, ResistorLoad(REFERENCE)),),
+        tuple(Trial(path, load) for path, load in loads.items()),
+        tuple(Trial(path, ResistorLoad(r)) for path, r in resistors.items()),
         **{**middle, **settings},
     )
+
+
+def rung(load: str, **settings: Any) -> Scene:
+    """One scene; `settings` as `recorded` takes them."""
+    return recorded({TRIAL: LOADS[load]}, **settings)
 
 
 def ladder() -> Mapping[str, Scene]:

@@ -32,8 +32,8 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
+from benchmarks.machine import ROOT
 from benchmarks.mutants import Mutant, drawn, mutants
-from benchmarks.provenance import ROOT
 from benchmarks.rates import clopper_pearson
 from benchmarks.runner import Target, at_most, each, option, report, tabled
 

@@ -33,7 +33,7 @@ import scipy.interpolate
 from jaxtyping import Complex, Float
 
 import etid
-from benchmarks.provenance import ROOT
+from benchmarks.machine import ROOT
 from benchmarks.spice import PARTS
 from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.replacing import replacing

@@ -9,21 +9,21 @@ to those with white noise. The targets are those of `benchmarks.coverage`.
 """
 
 import argparse
-import collections
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Float
 
 import etid
-from benchmarks.coverage import Draws, draw, targets
+from benchmarks.coverage import identified, targets
 from benchmarks.disturbances import Hum
-from benchmarks.estimators import driver_of
 from benchmarks.laboratory import Record
+from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import all_records, both, out, undisturbed
 from benchmarks.runner import Target, option, report
 
+TRUTH = {path: dataclasses.astuple(skin) for path, skin in LOADS.items()}
 FIRST = 2000  # number of the first driver
 HUM = 0.01  # [V at the converter]
 
@@ -76,22 +76,14 @@ OPTIONS = (
 )
 
 
-def found(
+def studies(
     change: Callable[[Record], Record], snr_db: float, drivers: int
-) -> tuple[dict[str, Draws], float]:
-    """Fits of a dry and a damp recording behind each driver, and their median χ²."""
-    rows, chi2 = collections.defaultdict(list), []
+) -> Iterator[etid.Study]:
+    """A dry and a damp recording behind each driver, and its calibration."""
     for number in range(FIRST, FIRST + drivers):
-        study = all_records(change)(undisturbed(number, snr_db))
-        records = [one.recording(number) for one in study.trials]
-        driver = driver_of([one.recording(number) for one in study.calibrations], None)
-        fits = None if driver is None else etid.identify_skins(records, driver)
-        for i, one in enumerate(study.trials):
-            fit = None if fits is None else fits[i]
-            rows[one.path].append(draw(fit, study.truths[one.path].low.tolist()))
-            chi2.append(np.nan if fit is None else float(fit.chi2))
-    every = {path: Draws.of(of) for path, of in rows.items()}
-    return every, float(np.nanmedian(chi2))
+        of = all_records(change)(undisturbed(number, snr_db))
+        records = [one.recording(number) for one in (*of.calibrations, *of.trials)]
+        yield etid.Study.from_recordings(records)
 
 
 def main(arguments: argparse.Namespace) -> bool:
@@ -100,7 +92,8 @@ def main(arguments: argparse.Namespace) -> bool:
     for snr_db in arguments.snr_db:
         usual = None
         for name in arguments.only or KINDS:
-            every, chi2 = found(KINDS[name], snr_db, arguments.drivers)
+            every = identified(studies(KINDS[name], snr_db, arguments.drivers), TRUTH)
+            chi2 = np.nanmedian([of.chi2 for of in every.values()])
             errors = [np.nanmedian(of.stderr, axis=0) for of in every.values()]
             usual = errors if usual is None else usual
             wider = "; ".join(

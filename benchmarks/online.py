@@ -18,14 +18,11 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
-from benchmarks import online_rival
-from benchmarks.ladder import TWO
-from benchmarks.online_alarms import LOADS, SOON, alarms
-from benchmarks.provenance import RESULTS, write_csv
-from benchmarks.rivals import RivalError
+from benchmarks.machine import RESULTS, write_csv
+from benchmarks.online_alarms import LIFTED, LOADS, SOON, Fingertip, alarms
+from benchmarks.rivals import RivalError, exchange, make
 from benchmarks.runner import Target, at_least, at_most, option, report
 from etid.online.state import TrackerState
-from etid.simulation.scenes import Scene, Trial
 
 PINNED = True
 TICK = 0.08  # of the time between two pulses, which 99 % of the ticks must keep to
@@ -38,9 +35,12 @@ TARGETS = {
 }
 CHARGE = 80e-9  # [C] per phase
 RIVAL_TICKS = 30
+ENVIRONMENT, WORKER = "filterpy", "benchmarks.rivals.kalman_by_filterpy"
+OFF = 0.05  # of the elements, by which its start differs from what the tracker has found
 WARM = 50  # ticks before the first that counts: compilation, and the start of every electrode
 KINDS = 60  # different pulses, over and over
-NOISES = (60.0, 40.0)  # [dB] of the false alarms
+NOISES = (60.0, 40.0)  # [dB] of the false alarms; the ticks have the first
+CHANGE = 1e-3  # random walk that the tracker expects in the ticks [1/√pulse]
 
 OPTIONS = (
     option("--electrodes", default=98),
@@ -82,7 +82,7 @@ def ticks(electrodes: int, lifted: int, number: int) -> Iterator[Target]:
     logs = np.asarray(state.electrodes.own)[:, :-1]
     some, theirs = pulses[np.arange(RIVAL_TICKS) % len(pulses)], np.nan
     try:
-        theirs = online_rival.seconds(tracker, some, logs)
+        theirs = seconds_of_filterpy(tracker, some, logs)
     except RivalError as error:
         print(f"filterpy: {error}")
     period = tracker.period / tracker.model.bands.sample_rate
@@ -121,15 +121,42 @@ def timed(
 
 def problem(electrodes: int, lifted: int) -> tuple[etid.Tracker, np.ndarray]:
     """A tracker, and pulses for it (pulse, electrode, sample)."""
-    trials = tuple(Trial(f"loaded/{i}", LOADS[i % len(LOADS)]) for i in range(electrodes))
-    study = Scene(trials, TWO, trigger_jitter_rms=50e-9).simulate(seed=0)
-    calibrations = list(study.calibrations.recordings())
-    driver = etid.identify_driver(calibrations)
-    tracker = etid.Tracker.of(driver, calibrations[0], electrodes=electrodes, change=1e-3)
-    records = list(study.loaded.recordings())
-    v_out = np.stack([r.v_th if i < lifted else r.v_out for i, r in enumerate(records)])
-    three = tracker.pulses(v_out)
-    noise = np.random.default_rng(1).standard_normal((KINDS // 3, *three.shape))
-    # As much noise again as the records have. Common noise would look like the driver.
-    many = three[None] + 0.01 * noise
-    return tracker, many.reshape(-1, *three.shape[1:])
+    display, loads = Fingertip(electrodes, NOISES[0], CHANGE), np.arange(electrodes) % len(LOADS)
+    loads[:lifted] = LIFTED
+    return display.tracker, np.stack([*display.pulses(loads, KINDS)])
+
+
+def seconds_of_filterpy(
+    tracker: etid.Tracker,
+    pulses: Float[np.ndarray, "pulse lane sample"],
+    logs: Float[np.ndarray, "lane element"],
+) -> float:
+    """Median processor time of filterpy for one pulse at all electrodes, the bands apart [s].
+
+    Args:
+        tracker: Tracker of `SkinRC` whose model is used.
+        pulses: Windows of the first pulses after a start [V].
+        logs: Logarithms of the elements that the tracker has found.
+
+    Raises:
+        RivalError: filterpy cannot be installed or run.
+    """
+    missing = make(ENVIRONMENT)
+    if missing:
+        raise RivalError(missing)
+    seen = [tracker.projection.seen(v_out, tracker.adc_range) for v_out in pulses]
+    variance, begins = np.stack([of.variance for of in seen]), np.arange(len(pulses)) % 3
+    found = exchange(
+        ENVIRONMENT,
+        WORKER,
+        gains=np.stack([np.asarray(one.gain()) for one in seen]),
+        variances=variance[:, :, None] / np.asarray(tracker.model.bands.weight),
+        delays=begins * tracker.period - np.round(begins * tracker.period),
+        frequency=np.asarray(tracker.model.bands.frequency),
+        turn=np.asarray(tracker.model.turn),
+        source=np.asarray(tracker.model.source),
+        change=np.asarray(tracker.change),
+        start=logs + OFF,
+    )
+    print(f"filterpy    differs by at most {np.abs(found['logs'] - logs).max():.1%} in an element")
+    return float(np.median(found["seconds"]))

@@ -1,4 +1,4 @@
-"""The paper's Tables I to IV from simulated measurements, and what causes its errors.
+"""What causes the errors of the paper: its Tables I and IV from simulated measurements.
 
 Five laboratories make the same recordings. `good` has 60 dB and one clock. Each of the next three
 has one thing worse: white noise of 40 or of 30 dB, or trigger delays of 200 ns (rms) in every
@@ -8,29 +8,34 @@ same in every trial; delays spread its trials.
 
 A study is made several times, each with a calibration of its own. `--source spice` takes its
 waveforms from ngspice. `table_4.svg` shows error and scatter of the built circuit by cause; `make
-demo` draws the other figures of the paper.
+demo` makes all tables and figures of the paper.
+
+Rows are tidy: one per laboratory, method and element, beside what the paper prints. Errors, spreads
+and scatters are in per cent. A fit without a circuit (an estimate that is negative or complex)
+enters no statistics; `circuits` of `fits` do.
 """
 
 import argparse
 import dataclasses
 import pathlib
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 import etid
 from benchmarks import charts
-from benchmarks import paper_tables as tables
 from benchmarks.ladder import SOURCES
-from benchmarks.paper_tables import Row
-from benchmarks.provenance import write_csv
+from benchmarks.machine import write_csv
 from benchmarks.runner import QUICK, Target, at_most, option, report
+from etid.circuits.display import DISPLAY
 from etid.paper.tables import LABORATORIES as ENDS
-from etid.paper.tables import METHODS, ORDER, Outcome, identify
-from etid.report.html import Section
+from etid.paper.tables import METHODS, ORDER, Outcome, Truth, errors, identify, resistor_errors
+from etid.report.html import Section, Table, number
 from etid.simulation import published
-from etid.simulation.scenes import Scene, Trial
+from etid.simulation.scenes import Scene
 
 LABORATORIES: Mapping[str, Mapping[str, float]] = {
     "good": ENDS["quiet"],
@@ -40,8 +45,11 @@ LABORATORIES: Mapping[str, Mapping[str, float]] = {
     "both": ENDS["noisy"],
 }
 DEFAULT, THEIRS = METHODS
+Row = dict[str, Any]
+Groups = Mapping[tuple[str, str], Sequence[Outcome]]
+"""The studies of each laboratory and method."""
 STUDIES = 4
-FEW = {"01", "02", "03"}  # trials of a quick run, and the last digits of its subjects
+FEW = {"", "01", "02", "03"}  # trials of a quick run; a resistor has one
 OWN_NOISE = "noise 30 dB"  # what the paper's RRSE of 4 to 13 % amounts to
 TARGETS = {
     "Table I at 60 dB, largest rms error of a resistor [%]": at_most(0.1),
@@ -52,17 +60,6 @@ TABLES = (
         "Table I: errors of five resistors [%]",
         "Mean over the studies, and standard deviation between them.",
         ("r", "paper_error", "error", "spread", "circuits", "fits"),
-    ),
-    *(
-        (
-            title,
-            "Typical fingertip: median, its error [%], spread between trials [%]. Subjects: range "
-            "of their medians; median and largest absolute error [%]. Means over the studies in "
-            "which every subject has a circuit.",
-            ("element", "paper_typical", "typical", "error", "spread", "lowest", "highest",
-             "subject_error", "worst", "circuits", "successful", "fits"),
-        )
-        for title in ("Table II: dry fingertips", "Table III: damp fingertips")
     ),
     (
         "Table IV: the built circuit",
@@ -81,17 +78,97 @@ OPTIONS = (
 
 
 def scene_of(laboratory: str, quick: bool) -> Scene:
-    """All experiments of the paper in one laboratory; a few trials and subjects if quick."""
+    """Resistors and built circuit of the paper in one laboratory; a few trials of it if quick."""
     whole = etid.scenes.paper(**LABORATORIES[laboratory])
-    few = tuple(filter(_is_among_few, whole.trials))
-    return dataclasses.replace(whole, trials=few) if quick else whole
+    few = tuple(of for of in whole.trials if not of.subject and (not quick or of.trial in FEW))
+    return dataclasses.replace(whole, trials=few)
 
 
-def _is_among_few(trial: Trial) -> bool:
-    is_subject = trial.subject not in ("", "typical")
-    return (not trial.trial or trial.trial in FEW) and (
-        not is_subject or trial.subject.removeprefix("s") in FEW
-    )
+def _with_circuit(fits: etid.Fits) -> etid.Fits:
+    """The fits that found a circuit."""
+    values = np.array([getattr(fits.circuit, name) for name in fits.circuit.names()])
+    return fits.take(np.asarray(np.isfinite(values).all(axis=0)))
+
+
+def _sd(values: np.ndarray) -> float:
+    return float(np.std(values, ddof=1)) if values.size > 1 else np.nan
+
+
+def _mean(values: Iterable[float]) -> float:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else np.nan
+
+
+def _counts(every: Sequence[etid.Fits]) -> Row:
+    return {
+        "successful": sum(len(fits.successful()) for fits in every),
+        "circuits": sum(len(_with_circuit(fits)) for fits in every),
+        "fits": sum(map(len, every)),
+    }
+
+
+def table_1(groups: Groups) -> list[Row]:
+    """Errors of five known resistors, over the studies."""
+    rows = []
+    for (laboratory, method), outcomes in groups.items():
+        found = [resistor_errors(outcome) for outcome in outcomes]
+        for r, paper in published.TABLE_1.items():
+            every = np.array([of[r] for of in found])
+            some = every[np.isfinite(every)]
+            row = {"laboratory": laboratory, "method": method, "r": r, "paper_error": paper}
+            row |= {"error": _mean(some), "spread": _sd(some)}
+            row |= {"rms": float(np.sqrt(_mean(some**2)))}
+            rows.append({**row, "circuits": some.size, "fits": every.size})
+    return rows
+
+
+def table_4(groups: Groups, truth: Truth) -> list[Row]:
+    """The built circuit: mean error and scatter of the trials of a study.
+
+    `error` is the mean over all studies, `between` the standard deviation of the studies' means,
+    which is the error of their calibrations; `scatter` that of the trials within a study.
+    `stderr` is the standard error of a study's mean as the fits tell it: what they share, and the
+    mean of what they do not.
+    """
+    rows = []
+    for (laboratory, method), outcomes in groups.items():
+        every = [outcome.skins.where(condition="built") for outcome in outcomes]
+        some = [fits for fits in map(_with_circuit, every) if len(fits) > 1]
+        for i, name in enumerate(etid.SkinRC.names()):
+            found = [errors(fits, truth)[name] for fits in some]
+            means = np.array([errors.mean() for errors in found])
+            row: Row = {"laboratory": laboratory, "method": method, "element": name}
+            row["paper_error"], row["paper_scatter"] = published.TABLE_4[name]
+            row |= {"error": _mean(means), "between": _sd(means)}
+            row["scatter"] = float(np.sqrt(_mean(errors.var(ddof=1) for errors in found)))
+            row["stderr"] = _mean(_stderr_of_mean(fits, truth, i) for fits in some)
+            row["rrse"] = 100 * float(np.median([np.median(fits.rrse) for fits in every]))
+            rows.append({**row, **_counts(every), "studies": len(some)})
+    return sorted(rows, key=lambda row: ORDER.index(row["element"]))
+
+
+def _stderr_of_mean(fits: etid.Fits, truth: Truth, i: int) -> float:
+    """Standard error of the mean of element i over trials with one driver [%]."""
+    known = truth[str(fits.labels["path"][0])][etid.SkinRC.names()[i]]
+    total, shared = (np.asarray(cov)[:, i, i].mean() for cov in (fits.cov, fits.fit.shared_cov))
+    return float(100 / known * np.sqrt(shared + (total - shared) / len(fits)))
+
+
+def show(rows: Sequence[Row], columns: Sequence[str]) -> Table:
+    """A table for the terminal: the laboratory, the method, and these columns of the rows."""
+    heads = ("laboratory", "method", *columns)
+    return Table(heads, tuple(tuple(_cell(name, row) for name in heads) for row in rows))
+
+
+def _cell(name: str, row: Row) -> str:
+    """One cell; resistances in the unit in which circuits are printed."""
+    value = row[name]
+    if not isinstance(value, float):
+        return str(value)
+    if name == "r":
+        scale, symbol = DISPLAY["ohm"]
+        return f"{value / scale:.4g} {symbol}"
+    return number(value)
 
 
 def targets(first: Sequence[Row], fourth: Sequence[Row]) -> Iterator[Target]:
@@ -166,12 +243,10 @@ def main(arguments: argparse.Namespace) -> bool:
         study = SOURCES[source](scene_of(laboratory, quick), seed)
         for method in METHODS:
             groups.setdefault((laboratory, method), []).append(identify(laboratory, study, method))
-    first, fourth = tables.table_1(groups), tables.table_4(groups, truth)
-    second, third = (tables.table_fingertips(groups, truth, of) for of in ("dry", "damp"))
-    for number, rows in enumerate((first, second, third, fourth), 1):
-        title, text, columns = TABLES[number - 1]
-        write_csv(folder / f"table_{number}.csv", [{"source": source, **row} for row in rows])
-        print(f"\n{Section(title, text, (tables.show(rows, columns),))}")
+    first, fourth = table_1(groups), table_4(groups, truth)
+    for (title, text, columns), which, rows in zip(TABLES, (1, 4), (first, fourth), strict=True):
+        write_csv(folder / f"table_{which}.csv", [{"source": source, **row} for row in rows])
+        print(f"\n{Section(title, text, (show(rows, columns),))}")
     print(f"\n{textwrap.fill(cause(fourth), 100)}\n")
     draw(fourth, folder / "table_4.svg")
     print(f"Tables and figure: {folder.resolve()}")

@@ -1,4 +1,4 @@
-"""What others take for a fit: SciPy, stock optimistix, jaxopt.
+"""What others take for a fit: SciPy, stock optimistix, jaxopt; and trials behind one driver for it.
 
 All get the same residual and the same start. The two solvers in JAX, which have no filters, run as
 their users run them, `vmap` over lanes, `SIDE_BY_SIDE` at a time. SciPy goes from lane to lane with
@@ -8,7 +8,7 @@ residual and Jacobian in NumPy, and is measured on a few of them.
 import importlib
 import warnings
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,19 +16,155 @@ import numpy as np
 import optimistix as optx
 import scipy.optimize
 import scipy.signal
+from jaxtyping import Array, Float
 
 import etid
-from benchmarks.problem import START, ByNumPy, Problem, harmonics, terms
+from benchmarks.ladder import recorded
+from etid.circuits.circuit import SkinRC
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_start import start_of_skin
+from etid.estimators.lanes import Harmonics, stacked
+from etid.estimators.maximum_likelihood.gains import Gains
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import WELL
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.batches import each
+from etid.identify.one import known_of
+from etid.recordings.preflight import Inspected
+from etid.signals.filtering import lfilter
+from etid.simulation.published import REFERENCE, TYPICAL
+from etid.solvers.levenberg_marquardt import normal_equations
 
+SAMPLES = 33_330  # ten pulse periods at 200 kHz
+LOAD = TYPICAL["dry"]
+# Logarithms of typical values, a factor of two from the truth, and no delay.
+START = np.append(np.log([20e3, 100e3, 0.3e-9]), 0.0)
 SIDE_BY_SIDE = 98
 BY_SCIPY = 8  # lanes
 B, A = cast(tuple[np.ndarray, np.ndarray], scipy.signal.butter(6, 0.3))
 
+
+def filter_calls(v: Any) -> dict[str, Callable[[], Any]]:
+    """One pass, gradient and normal equations of three coefficients of a filter of order 6."""
+    v, b, a = map(jnp.asarray, (v, B, A))
+    forward = jax.jit(lambda b, v: lfilter(b, a, v)[0])
+    gradient = jax.jit(jax.grad(lambda b, v: jnp.sum(lfilter(b, a, v)[0] ** 2)))
+
+    def three(q, v):
+        return lfilter(b, a.at[1:4].add(q), v)[0]
+
+    equations = jax.jit(lambda q, v: normal_equations(three, q, v))
+    return {
+        "filter": lambda: forward(b, v),
+        "gradient": lambda: gradient(b, v),
+        "normal equations of 3": lambda: equations(jnp.zeros(3), v),
+    }
+
+
 Run = Callable[[np.ndarray], Any]  # lanes by their numbers
+
+
+class Problem(NamedTuple):
+    """Trials of one load with their driver."""
+
+    study: etid.Study  # all recordings
+    driver: etid.Driver  # as identified from the calibration
+    records: list[etid.Recording]  # the trials
+    lanes: Harmonics  # their harmonics, stacked
+    known: GivenDriver  # what the calibration tells at these
+
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Both voltages of all trials, stacked."""
+        voltages = [(record.v_th, record.v_out) for record in self.records]
+        v_th, v_out = (np.stack(column) for column in zip(*voltages, strict=True))
+        return v_th, v_out
+
+    def load(self, one: Any) -> Load:
+        """A lane with Z_th as it is; calling it gives the terms of elements and delay."""
+        rate = jnp.asarray(one.sample_rate)
+        gains = Gains(self.known, SkinRC(), one.spectrum.frequency, rate)
+        return Load(gains, Records.of(one.spectrum))
+
+
+def terms(own: Float[Array, " own"], load: Load) -> Float[Array, " term"]:
+    """What all solvers minimise the squares of."""
+    return load(own)
+
+
+def harmonics(record: etid.Recording) -> Harmonics:
+    """The lane of a trial: harmonics and noise."""
+    return Harmonics.of(Inspected(record))
+
+
+def problem_of(study: etid.Study, driver: etid.Driver) -> Problem:
+    """The same for given recordings."""
+    records = list(study.loaded.recordings())
+    lanes = [harmonics(record) for record in records]
+    known = known_of(lanes[0], driver, False, MAXIMUM_LIKELIHOOD)
+    assert isinstance(known, GivenDriver)
+    return Problem(study, driver, records, stacked(lanes), known)
+
+
+def problem(samples: int, lanes: int, sample_rate: float = 200e3) -> Problem:
+    """Simulate `lanes` trials of `samples` samples and identify their driver."""
+    loads = {f"loaded/{i}": LOAD for i in range(lanes)}
+    resistors = {"calibration/0": REFERENCE}
+    scene = recorded(loads, resistors, samples=samples, sample_rate=sample_rate)
+    study = scene.simulate(seed=3)
+    driver = etid.identify_driver(study["calibration/0"], method="maximum_likelihood", throw=False)
+    return problem_of(study, driver)
+
+
+class ByNumPy:
+    """The same terms and their Jacobian as one would write them with NumPy.
+
+    e = w (Y − G X), w = √(2 / (σ_y² + |G|² σ_x²)), G = Z_L / (Z_L + Z_th) e^(−jωτ), and a weak
+    prior of the delay.
+    """
+
+    def __init__(self, load: Load):
+        spectrum = load.records
+        used = np.asarray(spectrum.selected[0])
+        self.x, self.y = np.asarray(spectrum.x)[used], np.asarray(spectrum.y[0])[used]
+        self.of_x = np.asarray(spectrum.variance_x)[used]
+        self.of_y = np.asarray(spectrum.variance_y[0])[used]
+        self.s = 2j * np.pi * np.asarray(spectrum.frequency)[used]
+        driver = load.gains.driver
+        assert isinstance(driver, GivenDriver)
+        self.z_th = np.asarray(driver.z_th(load.gains.w(driver.mean)))[used]
+        self.rate = float(load.gains.sample_rate)
+        self.width = float(load.gains.widths(jnp.zeros(4))[-1])
+
+    def _parts(self, q: np.ndarray):
+        r_s, r_p, c_p = np.exp(q[:3])
+        one = 1 / (1 + self.s * r_p * c_p)
+        z = r_s + r_p * one
+        turn = np.exp(-self.s * q[3] / self.rate)
+        total = 1 / (z + self.z_th)
+        g = z * total * turn
+        weight = np.sqrt(2 / (self.of_y + np.abs(g) ** 2 * self.of_x))
+        return r_s, r_p, c_p, one, turn, total, g, weight, self.y - g * self.x
+
+    def terms(self, q: np.ndarray) -> np.ndarray:
+        """Residuals."""
+        *_, weight, e = self._parts(q)
+        e = e * weight
+        return np.concatenate([e.real, e.imag, [q[3] / self.width]])
+
+    def jacobian(self, q: np.ndarray) -> np.ndarray:
+        """Their derivatives."""
+        r_s, r_p, c_p, one, turn, total, g, weight, e = self._parts(q)
+        by_z = self.z_th * total**2 * turn
+        slope = r_p * one**2
+        of_g = np.stack(
+            [by_z * r_s, by_z * slope, -by_z * slope * self.s * r_p * c_p, -g * self.s / self.rate]
+        )
+        of_weight = -0.5 * weight**3 * self.of_x * (np.conj(g) * of_g).real
+        columns = of_weight * e - of_g * self.x * weight
+        last = np.array([[0.0, 0.0, 0.0, 1 / self.width]])
+        return np.concatenate([columns.real.T, columns.imag.T, last])
 
 
 def _each(one: Callable[[Any], Any], data: Any) -> Run:

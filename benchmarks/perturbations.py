@@ -36,21 +36,19 @@ from benchmarks.estimators import (
     DETERMINED,
     ELEMENTS,
     FAR,
-    NOTHING,
     OFF,
     OURS,
     Answer,
     Drivers,
-    method_of,
+    fits,
+    found_by,
 )
 from benchmarks.laboratory import Record
-from benchmarks.ladder import LOADS
-from benchmarks.mappings import make_room
+from benchmarks.ladder import LOADS, recorded
+from benchmarks.machine import make_room
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
-from benchmarks.perturbed_study import REFERENCE, Truth, undisturbed
+from benchmarks.perturbed_study import Truth, undisturbed
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, tabled
-from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
 
 TARGETS = {
     "silent": at_most(0),  # but for what no test can see
@@ -115,32 +113,10 @@ def error_of(values: np.ndarray, truth: Truth, remarked: bool) -> np.ndarray:
     return np.where(np.isnan(truth.low), 0.0, error)
 
 
-def said(
-    records: Sequence[etid.Recording], driver: etid.Driver | None, name: str
-) -> list[tuple[str, np.ndarray, np.ndarray, bool]]:
-    """Verdict, elements, standard errors, and whether there is a remark, for each recording."""
-    if driver is None:
-        return [("driver_failed", NOTHING, NOTHING, False)] * len(records)
-    fits = etid.identify_skins(records, driver, method=method_of(name))
-    remarks = np.broadcast_to(np.asarray(getattr(fits.fit, "remarks", 0)), len(fits))
-    values, errors = (
-        np.stack([np.asarray(getattr(of, element)) for element in ELEMENTS], -1)
-        for of in (fits.circuit, fits.stderr)
-    )
-    return list(zip(map(str, fits.verdicts), values, errors, map(bool, remarks), strict=True))
-
-
 @functools.cache
 def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[str, np.ndarray]:
     """Bounds of the undisturbed scene with this noise and converter, by path."""
-    scene = Scene(
-        tuple(Trial(name, skin) for name, skin in LOADS.items()),
-        (Trial("calibration", ResistorLoad(REFERENCE)),),
-        snr_db=snr_db,
-        samples=samples,
-        bits=bits,
-        full_scale=full_scale,
-    )
+    scene = recorded(LOADS, snr_db=snr_db, samples=samples, bits=bits, full_scale=full_scale)
     return {path: np.array(list(of.relative.values())) for path, of in etid.bound(scene).items()}
 
 
@@ -161,20 +137,20 @@ def answers_of(
             together.setdefault((method, id(known[method, name])), []).extend(trials)
         for (method, _), trials in together.items():
             driver = known[method, trials[0][0]]
-            answers = said([of.recording(number) for _, of, _ in trials], driver, method)
-            for (name, of, truth), (verdict, values, stderr, remarked) in zip(
-                trials, answers, strict=True
-            ):
-                one = Answer(
-                    *(method, number, of.path, verdict),
-                    error=error_of(values, truth, remarked),
-                    stderr=stderr / ((truth.low + truth.high) / 2),
-                    bound=_bounds(snr_db, of.samples, of.bits, of.full_scale)[of.path],
-                    exact=not truth.words,
-                    perturbation=name,
-                    snr_db=snr_db,
+            records = [of.recording(number) for _, of, _ in trials]
+            for (name, of, truth), fit in zip(trials, fits(records, driver, method), strict=True):
+                values, stderr, verdict = found_by(fit)
+                found.append(
+                    Answer(
+                        *(method, number, of.path, verdict),
+                        error=error_of(values, truth, fit is not None and int(fit.remarks) != 0),
+                        stderr=stderr / ((truth.low + truth.high) / 2),
+                        bound=_bounds(snr_db, of.samples, of.bits, of.full_scale)[of.path],
+                        exact=not truth.words,
+                        perturbation=name,
+                        snr_db=snr_db,
+                    )
                 )
-                found.append(one)
         make_room()
         return found
 

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.provenance import RESULTS, ROOT, provenance, write_csv
+from benchmarks.machine import RESULTS, ROOT, provenance, write_csv
 from benchmarks.rates import Rate
 from etid.identify import file as streaming
 from etid.recordings.replacing import replacing

@@ -1,6 +1,7 @@
 """A file of 10^5 recordings: how long reading and fitting take, in how much memory, and `kill -9`.
 
-Every measurement runs in a process of its own, on as many cores as it has workers. The file lies
+Every measurement is a job in a process of its own, whose peak memory is the job's, on as many cores
+as it has workers: `python -m benchmarks.scale JOB` with a JSON object prints another. The file lies
 in the page cache, which flatters reading; reading alone is h5py, recording after recording.
 Compilation is in no time but `start` and the CPU time of workers, which tells of other work on the
 machine.
@@ -8,25 +9,27 @@ machine.
 
 import argparse
 import collections
+import contextlib
 import json
 import os
 import pathlib
+import resource
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import h5py
+import jax
 import numpy as np
 
+import etid
 from benchmarks.large_file import LAYOUTS, large_file
-from benchmarks.one_run import READERS
-from benchmarks.provenance import ROOT, write_csv
+from benchmarks.machine import ROOT, cores, write_csv
 from benchmarks.runner import QUICK, Target, at_least, at_most, option, report
-from benchmarks.timing import cores
 from etid.estimators.registry import names
 from etid.identify import file as streaming
 
@@ -54,6 +57,91 @@ OPTIONS = (
 )
 
 
+def _by_h5py(file: str, whole_stacks: bool) -> None:
+    """Read all samples with h5py alone, one recording after the other or a stack at once."""
+
+    def visit(_: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and (item.ndim == 1 or whole_stacks):
+            item[()]
+        elif isinstance(item, h5py.Dataset):
+            for row in range(item.shape[0]):
+                item[row]
+
+    with h5py.File(file) as opened:
+        opened.visititems(visit)
+
+
+def _by_etid(file: str) -> None:
+    """Load all recordings."""
+    with etid.read(file) as study:
+        for _ in study.recordings():
+            pass
+
+
+READERS: dict[str, Callable[[str], None]] = {
+    "h5py": lambda file: _by_h5py(file, False),
+    "h5py, whole stacks": lambda file: _by_h5py(file, True),
+    "etid": _by_etid,
+}
+
+
+def _fit(job: dict[str, Any]) -> dict[str, Any]:
+    """Fit a file; the same with a small one before, so that compilation is apart."""
+    arguments: dict[str, Any] = {"method": job["method"]}
+    with contextlib.ExitStack() as stack:
+        if job["workers"] > 1:
+            arguments["executor"] = stack.enter_context(streaming.processes(job["workers"]))
+        start = 0.0
+        if job["warm"]:
+            target = pathlib.Path(job["target"]).with_suffix(".warm.h5")
+            streaming.PART = job["warm_part"]
+            start = _timed(lambda: streaming.fit_file(job["warm"], target, **arguments))[1]
+            target.unlink()
+        streaming.PART = job["part"]
+        if job["log"]:
+            _log_parts(job["log"])
+        arguments["resume"], before = job["resume"], time.process_time()
+        outcome, seconds = _timed(
+            lambda: streaming.fit_file(job["file"], job["target"], **arguments)
+        )
+        cpu = time.process_time() - before
+    # Of workers, which have ended here, it contains their start.
+    workers = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu += workers.ru_utime + workers.ru_stime
+    return {"start": start, "seconds": seconds, "cpu": cpu, "verdicts": outcome.fits.counts()}
+
+
+def _log_parts(log: str) -> None:
+    """Note each part when it is begun."""
+    real = streaming.identify_part
+
+    def logged(drivers, paths, *rest):
+        with open(log, "a") as file:
+            file.write(f"{paths[0]}\n")
+        return real(drivers, paths, *rest)
+
+    streaming.identify_part = logged
+
+
+def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
+    begin = time.perf_counter()
+    found = call()
+    return found, time.perf_counter() - begin
+
+
+def done(job: dict[str, Any]) -> dict[str, Any]:
+    """Do a job; seconds, and peak memory of this process and of its largest child [B]."""
+    if job["what"] == "fit":
+        found = _fit(job)
+    else:
+        found = {"seconds": _timed(lambda: READERS[job["what"]](job["file"]))[1]}
+    own, children = (
+        1024 * resource.getrusage(who).ru_maxrss
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    return {**found, "memory": own, "worker_memory": children}
+
+
 class Plan(NamedTuple):
     """What to measure."""
 
@@ -71,7 +159,7 @@ def _start(folder: pathlib.Path, job: dict[str, Any]) -> subprocess.Popen[bytes]
         "JAX_COMPILATION_CACHE_DIR": str(folder.absolute() / "xla"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
-    command = [sys.executable, "-m", "benchmarks.one_run", json.dumps(job)]
+    command = [sys.executable, "-m", "benchmarks.scale", json.dumps(job)]
     return subprocess.Popen(command, cwd=ROOT, env=os.environ | cache, stdout=subprocess.PIPE)
 
 
@@ -229,3 +317,8 @@ def main(arguments: argparse.Namespace) -> bool:
     if arguments.output is not None:
         write_csv(arguments.output, table)
     return report(targets(table, resumed))
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    print(json.dumps(done(json.loads(sys.argv[1]))))

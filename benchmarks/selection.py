@@ -5,7 +5,7 @@
 
 Recordings of five kinds of circuits, dry and damp, behind drivers drawn anew, from 20 to 80 dB
 (`benchmarks.selection_draws`). Written are `selection.csv`, one row for each truth and SNR,
-`selection_map.csv`, one row for each cell of the failure map with `circuit="auto"`, and the picture
+`counts.csv`, one row for each cell of the failure map with `circuit="auto"`, and the picture
 `selection.svg`. `benchmarks.selection_counts` says what "decisive" means, and which criteria are
 compared.
 """
@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 import etid
-from benchmarks import charts, selection_map, selection_rival
+from benchmarks import charts, selection_rival
 from benchmarks import selection_counts as counts
 from benchmarks.estimators import Answer
 from benchmarks.failure_axes import Cell
 from benchmarks.failure_draws import AUTO, Effort, answers
+from benchmarks.machine import median_time, write_csv
 from benchmarks.perturbed_study import DELAY
-from benchmarks.provenance import write_csv
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
 from benchmarks.runner import (
     FOLDER,
@@ -42,7 +42,6 @@ from benchmarks.runner import (
     tabled,
 )
 from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
-from benchmarks.timing import median_time
 from etid.selection.search import USUAL
 from etid.simulation import scenes
 
@@ -114,7 +113,7 @@ def criteria(rows: Sequence[dict[str, Any]]) -> Iterator[Target]:
 def failures(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> Iterator[Target]:
     """Silent failures over the map, and right answers for skin that is not one RC."""
     asked = [one for answered in found for one in answered if one.target]
-    silent, elements = selection_map.missed_elements(asked)
+    silent, elements = counts.missed_elements(asked)
     low, high = clopper_pearson(silent, elements)
     text = f"{silent} of {elements} elements ({100 * low:.3f} to {100 * high:.3f} %)"
     name = "silent over the failure map"
@@ -125,7 +124,7 @@ def failures(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> Iterat
         for one in answered:
             if one.missed:
                 print(f"silent: {', '.join(cell.place.values())}: {one.path}, {one.seed}")
-    right = selection_map.right_from_40_db(every, found)
+    right = counts.right_from_40_db(every, found)
     if right.trials:
         yield _rate("right, not one RC, from 40 dB", right)
 
@@ -245,11 +244,11 @@ def main(arguments: argparse.Namespace) -> bool:
     print(f"etid: {1e3 * select_time(FIRST):.0f} ms for a choice (median)")
     targets += time_ratios(FEW_PAIRS if quick else PAIRS)
 
-    every = selection_map.chosen_cells()[:: STEP if quick else 1]
+    every = counts.chosen_cells()[:: STEP if quick else 1]
     of_map = [(cell, {AUTO: FEW if quick else MAP}) for cell in every]
 
     def rows_of_map(done: dict[int, list[Answer]]) -> list[dict[str, Any]]:
-        return [selection_map.row(every[number], found) for number, found in done.items()]
+        return [counts.map_row(every[number], found) for number, found in done.items()]
 
     answered = tabled(
         folder / "selection_map.csv", rows_of_map, answers, of_map,

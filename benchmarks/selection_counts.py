@@ -8,6 +8,10 @@ The criteria are compared on the same fits, all candidates being fitted, with th
 unchanged (`etid.selection.evidence`). AICc is −2 log L + 2 p + 2 p (p + 1) / (n − p − 1). The
 evidence of Laplace is −2 log ∫ L π with normal priors of the logarithms of the elements, the
 typical value within a factor of 10, and α uniform from 0 to 1.
+
+Cells, drivers and trials of the failure map with `circuit="auto"` are those of
+`benchmarks.failure_map`, and so is what *wrong* and *silent* mean. An answer is *right* if it is
+successful and no element is wrong.
 """
 
 import math
@@ -16,7 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.rates import NORMAL_95, rate
+from benchmarks.estimators import Answer
+from benchmarks.failure_axes import Cell, cells
+from benchmarks.rates import NORMAL_95, Rate, rate
 from benchmarks.selection_draws import TRUTHS, Drawn, errors
 from etid.results.fit import Fit
 from etid.selection.evidence import best, bic, elements
@@ -26,6 +32,9 @@ DECISIVE = 10.0
 DECISIVE_SNR = 30.0  # [dB] at least
 QUANTITIES = ("R_s", "Z(0)", "corner")
 PRIOR = math.log(10.0)  # standard deviation of the logarithm of an element
+
+OTHER_SKIN = "SNR and skin that is not one RC"
+RIGHT_SNR = ("40 dB", "60 dB", "80 dB")
 
 Criterion = Callable[[Mapping[int, Fit]], dict[int, float]]
 
@@ -126,3 +135,51 @@ def covered(drawn: Sequence[Drawn], *names: str) -> tuple[list[bool], list[int]]
                 inside.append(abs(found[name]) < NORMAL_95)
                 drivers.append(one.driver)
     return inside, drivers
+
+
+def chosen_cells() -> list[Cell]:
+    """Cells of the map in which the circuit is not given, and the records are as usual.
+
+    Another length, rate or order would compile all candidates anew, a minute for each.
+    """
+    every = [cell for cell in cells() if cell.circuit is None]
+    [usual] = {cell.shape for cell in every if cell.chart == OTHER_SKIN}
+    return [cell for cell in every if cell.shape == usual]
+
+
+def is_right(one: Answer) -> bool:
+    """Whether an answer is successful and no element is wrong."""
+    return one.successful and not one.wrong
+
+
+def missed_elements(answers: Sequence[Answer]) -> tuple[int, int]:
+    """Elements determined to 10 % that are silently wrong, and number of all such elements."""
+    missed = [one.silent_elements & one.determined for one in answers]
+    return int(np.sum(missed)), int(np.sum([one.determined for one in answers]))
+
+
+def map_row(of: Cell, found: Sequence[Answer]) -> dict[str, Any]:
+    """One row of the table."""
+    asked = [one for one in found if one.target]
+    return {
+        **of.place,
+        "drivers": len({one.seed for one in found}),
+        "trials": len(found),
+        "right": float(np.mean([is_right(one) for one in found])),
+        "successful": sum(one.successful for one in found),
+        "silent": sum(one.silent for one in found),
+        "determined": len(asked),
+        "missed": sum(one.missed for one in asked),
+        "determined_elements": missed_elements(asked)[1],
+    }
+
+
+def right_from_40_db(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> Rate:
+    """Right answers for skin that is not one RC, from 40 dB on."""
+    asked = [
+        one
+        for cell, answered in zip(every, found, strict=True)
+        for one in answered
+        if cell.chart == OTHER_SKIN and cell.row in RIGHT_SNR
+    ]
+    return rate([is_right(one) for one in asked], [one.seed for one in asked])

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import etid
-from benchmarks.ladder import LOADS
-from benchmarks.mappings import make_room
-from benchmarks.perturbed_study import DELAY, PARTS, drawn_driver
+from benchmarks.ladder import LOADS, recorded
+from benchmarks.machine import make_room
+from benchmarks.perturbed_study import PARTS, drawn_driver
 from etid.circuits.circuit import (
     AbstractCircuit,
     ParallelRC,
@@ -28,8 +28,8 @@ from etid.results.fit import Fit
 from etid.selection.search import usual_circuits
 from etid.selection.selection import Selection
 from etid.simulation.published import REFERENCE
-from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, TransformerDriver
+from etid.simulation.scenes import Scene
+from etid.simulation.transformer import TransformerDriver
 
 SNR_DB = (20, 30, 40, 50, 60, 80)
 RESISTORS = {"dry": 216.6e3, "damp": 21.62e3}  # [ohm], of the paper's Table I
@@ -90,13 +90,8 @@ class Drawn:
 
 def scene(snr_db: float, driver: int) -> Scene:
     """A calibration and one recording of each truth behind a driver of its own."""
-    return Scene(
-        tuple(Trial(name, load) for name, load in TRUTHS.items()),
-        (Trial("calibration", ResistorLoad(REFERENCE)),),
-        drawn_driver(driver, PARTS, TransformerDriver()),
-        snr_db=snr_db,
-        trigger_jitter_rms=DELAY,
-    )
+    behind = drawn_driver(driver, PARTS, TransformerDriver())
+    return recorded(TRUTHS, {"calibration": REFERENCE}, driver=behind, snr_db=snr_db)
 
 
 def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Selection]:

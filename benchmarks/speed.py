@@ -10,20 +10,16 @@ import sys
 from collections.abc import Iterator
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.signal
 
 import etid
 from benchmarks import online, peers
-from benchmarks.peers import A, B
-from benchmarks.problem import LOAD, SAMPLES, Problem, harmonics, problem
+from benchmarks.machine import import_time, interpreter, median_time
+from benchmarks.peers import LOAD, SAMPLES, A, B, Problem, harmonics, problem
 from benchmarks.runner import QUICK, Target, report
-from benchmarks.timing import import_time, interpreter, median_time
 from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS
-from etid.signals.filtering import lfilter
 from etid.signals.noise import noise_std
-from etid.solvers.levenberg_marquardt import normal_equations
 
 PINNED = True
 PROCESSES = 3  # whose median counts
@@ -48,20 +44,8 @@ def filters(repeats: int) -> Iterator[Target]:
     """One pass, gradient and normal equations of a filter of order 6 over ten periods."""
     x = np.random.default_rng(0).normal(size=SAMPLES)
     reference = median_time(lambda: scipy.signal.lfilter(B, A, x), repeats)
-    data, b, a = map(jnp.asarray, (x, B, A))
-    forward = jax.jit(lambda b: lfilter(b, a, data)[0])
-    gradient = jax.jit(jax.grad(lambda b: jnp.sum(lfilter(b, a, data)[0] ** 2)))
-
-    def three(q, _):
-        return lfilter(b, a.at[1:4].add(q), data)[0]
-
-    equations = jax.jit(lambda q: normal_equations(three, q))
-    for name, call, most in (
-        ("filter / scipy lfilter", lambda: forward(b), 0.8),
-        ("gradient / scipy lfilter", lambda: gradient(b), 2.0),
-        ("normal equations of 3 / scipy lfilter", lambda: equations(jnp.zeros(3)), 4.0),
-    ):
-        yield costs(name, median_time(call, repeats), reference, most)
+    for (name, call), most in zip(peers.filter_calls(x).items(), (0.8, 2.0, 4.0), strict=True):
+        yield costs(f"{name} / scipy lfilter", median_time(call, repeats), reference, most)
 
 
 def solvers(of: Problem, repeats: int) -> Iterator[Target]:

@@ -20,8 +20,7 @@ import etid
 from benchmarks import rivals
 from benchmarks.estimators import DEFAULT, ELEMENTS, NOTHING, OURS, Answer, Drivers, method_of
 from benchmarks.ladder import CALIBRATION, SOURCES, START, TRIAL, ladder
-from benchmarks.mappings import make_room
-from benchmarks.provenance import write_csv
+from benchmarks.machine import make_room, write_csv
 from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report
 from benchmarks.speed_accuracy_chart import chart
 from etid.simulation.scenes import Scene

@@ -6,15 +6,17 @@ that the method itself reports.
 """
 
 import argparse
+import contextlib
 import json
 import pathlib
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
 
 import numpy as np
 
 import etid
-from benchmarks.provenance import write_csv
+from benchmarks.machine import write_csv
 from benchmarks.runner import option
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.registry import named, names
@@ -76,6 +78,16 @@ OPTIONS = (
 NUMBERS = ("bias", "spread", "rms", "bound", "sd", "chi2")
 
 
+@contextlib.contextmanager
+def imported(source: pathlib.Path) -> Iterator[etid.Study]:
+    """A SPICE recording as a study."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = pathlib.Path(folder, "study.h5")
+        etid.import_file(source, file)
+        with etid.read(file) as study:
+            yield study
+
+
 def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
     """One row per element: bias, spread, bound, reported standard error, all relative, in %."""
     trials = truth["trials"]
@@ -83,14 +95,11 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
     circuit: AbstractCircuit = etid.Resistor() if is_resistor else etid.SkinRC()
     if is_resistor and method != JOINT and not named(method).any_circuit:
         return []  # Steiglitz-McBride is written for the skin
-    with tempfile.TemporaryDirectory() as folder:
-        study_file = pathlib.Path(folder) / "study.h5"
-        etid.import_file(source, study_file)
-        with etid.read(study_file) as study:
-            if method == JOINT:
-                result = etid.identify_jointly(study, circuit=circuit)
-            else:
-                result = etid.identify_study(study, circuit=circuit, method=method)
+    with imported(source) as study:
+        if method == JOINT:
+            result = etid.identify_jointly(study, circuit=circuit)
+        else:
+            result = etid.identify_study(study, circuit=circuit, method=method)
     fits = result.fits
     fits = fits.take(np.argsort([int(path.rsplit("/", 1)[1]) for path in fits.labels["path"]]))
     driver = next(iter(result.drivers.values()), None)

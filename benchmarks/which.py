@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.estimators import OURS
-from benchmarks.provenance import RESULTS, ROOT
+from benchmarks.machine import RESULTS, ROOT
 from benchmarks.runner import option
 from benchmarks.speed_accuracy import FILE
 from etid.estimators.registry import names

@@ -7,7 +7,7 @@ import jax
 import pytest
 from hypothesis import settings
 
-from benchmarks.mappings import make_room
+from benchmarks.machine import make_room
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

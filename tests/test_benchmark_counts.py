@@ -23,9 +23,9 @@ from benchmarks import (
 from benchmarks.estimators import NOTHING, Answer
 from benchmarks.failure_axes import MOST, cells
 from benchmarks.ladder import LOADS
+from benchmarks.machine import RESULTS, write_csv
 from benchmarks.online_alarms import Alarms
 from benchmarks.perturbed_study import Truth
-from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.rates import clopper_pearson, expected_covered, expected_rms, rate
 from benchmarks.runner import Target, report
 from benchmarks.speed_accuracy import Result, dominators, front, ranked
@@ -86,7 +86,9 @@ def test_a_coverage_outside_the_target_is_missed_though_its_interval_touches_it(
     def fits(right, count=100):
         error = np.where(np.arange(count) < right, 0.0, 3.0)[:, None]
         one = np.ones((count, 1))
-        return coverage.Draws(error, one, np.full(count, "successful"), one[:, None])
+        return coverage.Draws(
+            error, one, np.full(count, "successful"), one[:, None], one[:, 0], one
+        )
 
     for right, met in ((92, False), (93, True), (97, True), (98, False), (60, False)):
         [covered, silent] = coverage.targets("dry", fits(right))

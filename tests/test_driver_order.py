@@ -140,14 +140,13 @@ def test_spice_drivers_have_the_order_that_is_visible(reference_data):
 
 
 def test_a_choice_is_right_if_its_error_is_near_the_best():
-    def drawn(order, error):
-        return benchmark.Draw(order, np.full((2, 3), error), np.zeros((2, 3)))
+    def found(orders, *errors):
+        of = np.broadcast_to(np.array(errors)[:, None, None], (4, 2, 3))
+        return benchmark.Found(np.broadcast_to(orders, 4), of, np.zeros((4, 2, 3)))
 
-    draws = [
-        {4: drawn(4, 1.05), 5: drawn(5, 1.0), 6: drawn(6, 2.0), "auto": drawn(order, error)}
-        for order, error in ((4, 1.05), (5, 1.0), (6, 2.0), (6, 1.4))
-    ]
-    assert benchmark.right(draws, (4, 5, 6)) == [True, True, False, True]
+    of = {4: found(4, 1.05), 5: found(5, 1.0), 6: found(6, 2.0)}
+    chosen = found([4, 5, 6, 6], 1.05, 1.0, 2.0, 1.4)
+    assert benchmark.right({"auto": chosen, **of}).tolist() == [True, True, False, True]
 
 
 def test_a_driver_of_two_poles_has_starts():

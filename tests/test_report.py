@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks import paper, paper_tables
+from benchmarks import paper
 from benchmarks.__main__ import asked
 from etid.paper import demo, tables
 from etid.report import html as report
 from etid.results.driver import DiscreteDriver
 from etid.results.verdicts import verdict, verdicts_of
-from etid.simulation.published import FINGERTIPS
 
 EXCESS = 1.1  # of every identified element over the true one
 
@@ -150,11 +149,11 @@ def groups(outcome):
 def test_tables_tell_errors_of_studies_from_scatter_of_trials(groups):
     truth = etid.scenes.paper().truth()
     between = np.sqrt(200.0)  # standard deviation of 10 and 30
-    for row in paper_tables.table_1(groups):
+    for row in paper.table_1(groups):
         assert (row["circuits"], row["fits"]) == (2, 2)
         found = [row[name] for name in ("error", "spread", "rms")]
         np.testing.assert_allclose(found, [20.0, between, np.sqrt(500.0)])
-    rows = paper_tables.table_4(groups, truth)
+    rows = paper.table_4(groups, truth)
     assert [row["element"] for row in rows] == ["r_p", "c_p", "r_s"]
     for row in rows:
         assert (row["circuits"], row["successful"], row["studies"]) == (46, 24, 2)
@@ -162,11 +161,6 @@ def test_tables_tell_errors_of_studies_from_scatter_of_trials(groups):
         np.testing.assert_allclose(found, [20.0, between, 0.0, 5.0], atol=1e-9)
         # every fit has an error of 100 %, nothing is shared, and a study has 23 trials
         assert row["stderr"] == pytest.approx(100 * 1.2 / np.sqrt(23))
-    for condition in ("dry", "damp"):
-        for row in paper_tables.table_fingertips(groups, truth, condition):
-            found = [row[name] for name in ("error", "spread", "subject_error", "worst")]
-            np.testing.assert_allclose(found, [20.0, 0.0, 20.0, 20.0], atol=1e-9)
-            assert row["paper_typical"] == FINGERTIPS[condition][row["element"]][0]
 
 
 def _without(fits, rows):
@@ -180,27 +174,21 @@ def _without(fits, rows):
 
 def test_fits_without_a_circuit_are_counted_and_left_out(outcome):
     truth = etid.scenes.paper().truth()
-    lost = np.isin(outcome.skins.labels["path"], ["built/01", "typical/dry/01"])
-    lost |= outcome.skins.labels["subject"] == "s05"
+    lost = outcome.skins.labels["path"] == "built/01"
     some = dataclasses.replace(outcome, skins=_without(outcome.skins, lost))
     groups = {("good", "output_error"): [some]}
-    for row in paper_tables.table_4(groups, truth):
+    for row in paper.table_4(groups, truth):
         assert (row["circuits"], row["fits"]) == (22, 23)
         assert row["error"] == pytest.approx(10.0)
-    for row in paper_tables.table_fingertips(groups, truth, "dry"):
-        assert (row["circuits"], row["fits"]) == (54, 60)
-        assert np.isnan(row["error"])  # a subject has none left: this study says nothing of ten
 
 
 def test_tables_by_cause_print_numbers_beside_those_of_the_paper(groups):
     truth = etid.scenes.paper().truth()
-    first, second, _, fourth = (columns for *_, columns in paper.TABLES)
-    table = paper_tables.show(paper_tables.table_1(groups), first)
+    first, fourth = (columns for *_, columns in paper.TABLES)
+    table = paper.show(paper.table_1(groups), first)
     assert table.rows[0] == ("good", "output_error", "21.62 kΩ", "4.26", "20.00", "14.14", "2", "2")
-    table = paper_tables.show(paper_tables.table_4(groups, truth), fourth)
+    table = paper.show(paper.table_4(groups, truth), fourth)
     assert table.rows[0][2:8] == ("r_p", "2.46", "17.50", "20.00", "0.00", "14.14")
-    table = paper_tables.show(paper_tables.table_fingertips(groups, truth, "dry"), second)
-    assert table.rows[0][2:4] == ("r_p", "186 kΩ")
 
 
 def test_each_cause_is_one_change_of_the_good_laboratory():
@@ -213,13 +201,10 @@ def test_each_cause_is_one_change_of_the_good_laboratory():
     assert {**alone[1], **alone[0]} == both
 
 
-def test_a_quick_study_has_some_of_everything():
-    few, whole = paper.scene_of("both", True), paper.scene_of("both", False)
-    assert len(few.trials) < len(whole.trials) / 4
-    assert {trial.condition for trial in few.trials} == {t.condition for t in whole.trials}
-    paths = {trial.path for trial in few.trials}
-    assert {"resistors/555k", "typical/damp/01", "s03/dry/03"} <= paths
-    assert "s04/dry/01" not in paths
+def test_a_study_has_the_resistors_and_trials_of_the_built_circuit():
+    few, whole = ([t.path for t in paper.scene_of("both", quick).trials] for quick in (True, False))
+    assert (len(few), len(whole)) == (5 + 3, 5 + 23)
+    assert {"resistors/555k", "built/03"} <= {*few}
 
 
 def test_what_is_missed_is_said(groups):
@@ -228,7 +213,7 @@ def test_what_is_missed_is_said(groups):
         ("good", paper.DEFAULT): groups["good", "output_error"],
         (paper.OWN_NOISE, paper.DEFAULT): groups["good", "output_error"],
     }
-    first, fourth = paper_tables.table_1(same), paper_tables.table_4(same, truth)
+    first, fourth = paper.table_1(same), paper.table_4(same, truth)
     assert [of.met for of in paper.targets(first, fourth)] == [False, True, True, True]
     for row in fourth:
         row["stderr"] /= 10.0
@@ -238,7 +223,7 @@ def test_what_is_missed_is_said(groups):
 @pytest.mark.slow
 def test_the_papers_tables_and_the_figure_of_causes_are_made(tmp_path, capsys):
     assert paper.main(asked(["paper", "--quick", "--folder", str(tmp_path)]))
-    for number in (1, 2, 3, 4):
+    for number in (1, 4):
         with (tmp_path / f"table_{number}.csv").open() as file:
             rows = list(csv.DictReader(file))
         assert {row["laboratory"] for row in rows} == set(paper.LABORATORIES)

@@ -75,7 +75,7 @@ def test_a_package_recovers_a_skin_behind_a_known_driver(name):
     noise = np.random.default_rng(4).normal(0, 1e-6, (2, SAMPLES))  # [V], which shows in 1e-6 of Z
     records_of = samples_of(X) + noise[0], samples_of(Y, 0.3e-6) + noise[1]
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # jaxopt's
-        found, ok = rival.skin(*records_of, (Q, 98.8e3), np.array(START), FS, F0)
+        found, ok = harmonic_fit.skin(rival.fit, *records_of, (Q, 98.8e3), np.array(START), FS, F0)
     assert ok
     np.testing.assert_allclose(found, TRUTH, rtol=1e-5)
 
@@ -130,7 +130,7 @@ def test_the_table_shows_what_is_missing_and_what_does_not_work():
 @pytest.mark.parametrize("name", RIVALS)
 def test_every_rival_has_a_module_an_environment_and_a_scene(name):
     folder, rival = pathlib.Path(rivals.__file__).parent, RIVALS[name]
-    assert (folder / f"{name}.py").exists()
+    assert (folder / f"{name.removesuffix(f'_{rival.estimator}')}.py").exists()
     assert (folder / f"{rival.environment}.txt").exists()
     assert rival.works in SCENES
 

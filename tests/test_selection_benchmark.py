@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks import selection, selection_map, selection_rival
+from benchmarks import selection, selection_counts, selection_rival
 from benchmarks.failure_draws import AUTO, judged, limits
 from benchmarks.selection_counts import CRITERIA, cell, choose, covered
 from benchmarks.selection_draws import TRUTHS, Drawn, quantities
@@ -93,8 +93,8 @@ def test_a_row_counts_choices_and_intervals(tmp_path):
 def test_a_circuit_without_a_series_resistor_claims_that_it_is_zero():
     [cell_of] = [
         one
-        for one in selection_map.chosen_cells()
-        if (one.chart, one.row, one.column) == (selection_map.OTHER_SKIN, "60 dB", "Cole, 0.9")
+        for one in selection_counts.chosen_cells()
+        if (one.chart, one.row, one.column) == (selection_counts.OTHER_SKIN, "60 dB", "Cole, 0.9")
     ]
     path, bound = cell_of.scene.trials[0].path, np.array([0.01, 0.01, np.nan])
     fit = made(etid.ParallelRC(186e3, 0.12e-9), 1000.0)
@@ -102,7 +102,7 @@ def test_a_circuit_without_a_series_resistor_claims_that_it_is_zero():
     assert said.error[0] == -1
     assert said.missed
     cole = made(etid.SkinCole(33.4e3, 186e3, 22e-6, 0.9), 1000.0)
-    assert selection_map.is_right(judged(cell_of, AUTO, 0, path, cole, bound))
+    assert selection_counts.is_right(judged(cell_of, AUTO, 0, path, cole, bound))
 
 
 def test_the_noise_of_exact_spectra_is_what_the_rival_is_told_and_choices_are_counted_by_truth():

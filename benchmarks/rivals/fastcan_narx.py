@@ -7,14 +7,7 @@ harmonics, and the record one averaged period.
 import numpy as np
 from fastcan.narx import NARX  # pyright: ignore[reportMissingImports]  # in its own environment
 
-from benchmarks.rivals.records import (
-    current_and_voltage,
-    elements,
-    harmonics,
-    measured_driver,
-)
-
-driver = measured_driver
+from benchmarks.rivals.records import current_and_voltage, elements, harmonics
 
 
 def skin(v_th, v_out, model, start, fs, f0):

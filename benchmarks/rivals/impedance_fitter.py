@@ -7,13 +7,11 @@ ImpedanceFitter makes: its own schemes know the modulus alone. No element is a t
 import impedancefitter  # pyright: ignore[reportMissingImports]  # in its own environment
 import numpy as np
 
-from benchmarks.rivals.records import harmonics, load_impedance, measured_driver
+from benchmarks.rivals.records import harmonics, load_impedance
 
 MEGA, KILO, NANO = 1e6, 1e3, 1e-9
 NAMES = ("series_R", "skin_R", "skin_C")
 impedancefitter.set_logger("WARNING")
-
-driver = measured_driver
 
 
 def skin(v_th, v_out, model, start, fs, f0):

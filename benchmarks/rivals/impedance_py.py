@@ -10,11 +10,9 @@ from impedance.models.circuits import (  # pyright: ignore[reportMissingImports]
     CustomCircuit,
 )
 
-from benchmarks.rivals.records import harmonics, load_impedance, measured_driver
+from benchmarks.rivals.records import harmonics, load_impedance
 
 MEGA, KILO, NANO = 1e6, 1e3, 1e-9
-
-driver = measured_driver
 
 
 def skin(v_th, v_out, model, start, fs, f0):

@@ -10,16 +10,9 @@ from jax_sysid.models import (  # pyright: ignore[reportMissingImports]  # in it
     LinearModel,
 )
 
-from benchmarks.rivals.records import (
-    current_and_voltage,
-    elements,
-    harmonics,
-    measured_driver,
-)
+from benchmarks.rivals.records import current_and_voltage, elements, harmonics
 
 jax.config.update("jax_enable_x64", True)
-
-driver = measured_driver
 
 
 def skin(v_th, v_out, model, start, fs, f0):

@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import jaxopt
 import numpy as np
 
-from benchmarks.rivals import harmonic_fit
-
 jax.config.update("jax_enable_x64", True)
 STEPS = 500
 
@@ -35,7 +33,3 @@ def _compiled(misfit, start, arguments):
     )
     found = solver.run(jnp.asarray(start), arguments)
     return found.params, found.state.iter_num
-
-
-driver = functools.partial(harmonic_fit.driver, fit)
-skin = functools.partial(harmonic_fit.skin, fit)

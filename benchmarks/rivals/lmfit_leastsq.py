@@ -1,14 +1,10 @@
 """lmfit's `minimize` (leastsq) on the harmonics: errors in both records, delays fitted."""
 
-import functools
-
 import numpy as np
 from lmfit import (  # pyright: ignore[reportMissingImports]  # in its own environment
     Parameters,
     minimize,
 )
-
-from benchmarks.rivals import harmonic_fit
 
 CALLS = 4000  # of the residuals; a fit of the driver needs some hundreds
 
@@ -29,7 +25,3 @@ def fit(misfit, start, arguments):
 
 def _values(parameters):
     return np.array([one.value for one in parameters.values()])
-
-
-driver = functools.partial(harmonic_fit.driver, fit)
-skin = functools.partial(harmonic_fit.skin, fit)

@@ -1,4 +1,7 @@
-"""One Octave for all draws of a problem: what `octave_arx` and `octave_n4sid` share."""
+"""Octave's `arx` of first order, its input advanced by a sample, and `n4sid` of one state.
+
+One Octave for all draws of a problem, with the estimators of its control package.
+"""
 
 import json
 import pathlib

@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from benchmarks.rivals import harmonic_fit
-
 jax.config.update("jax_enable_x64", True)
 SOLVER = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
 STEPS = 500
@@ -34,7 +32,3 @@ def _compiled(misfit, start, arguments):
         throw=False,
     )
     return found.value, found.result == optx.RESULTS.successful
-
-
-driver = functools.partial(harmonic_fit.driver, fit)
-skin = functools.partial(harmonic_fit.skin, fit)

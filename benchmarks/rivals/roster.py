@@ -20,11 +20,12 @@ class Rival(NamedTuple):
     # of `.rivals/`, made from the requirements of that name beside this file
     environment: str = "common"
     program: Mapping[str, str] = {}  # what must be on the path besides, by its Debian packages
+    estimator: str = ""  # which one of a module that has several for all draws at once
 
 
-def _by_octave(name: str, setting: str) -> Rival:
+def _by_octave(estimator: str, setting: str) -> Rival:
     octave = {"octave-cli": "octave octave-control"}
-    return Rival(name, "control", setting, program=octave)
+    return Rival(f"Octave {estimator}", "control", setting, program=octave, estimator=estimator)
 
 
 _PERIOD = "one averaged period of current and voltage at 1 MHz"
@@ -38,7 +39,7 @@ _LMFIT = "the same spectrum and weights, by the lmfit model it makes"
 _NARX = "linear, first order, free run, from current to voltage, 1 MHz; no delay"
 _NO_PENALTY = f"{_STATE}, L-BFGS without penalties; no delay"
 
-RIVALS: Mapping[str, Rival] = {  # by module
+RIVALS: Mapping[str, Rival] = {  # by module, and by estimator where it has several
     "scipy_harmonics": Rival("SciPy least_squares, harmonics", "scipy", _MINPACK, LATE),
     "lmfit_leastsq": Rival("lmfit leastsq", "lmfit", "the same residuals", LATE),
     "optimistix_lm": Rival("optimistix LM", "optimistix", f"{_SAME}, tolerances 1e-8", LATE),
@@ -53,6 +54,6 @@ RIVALS: Mapping[str, Rival] = {  # by module
     "sippy_oe": Rival("SIPPY OE", "sippy_unipi", f"{_ORDER}, {_ADVANCED}"),
     "fastcan_narx": Rival("fastcan NARX", "fastcan", _NARX),
     "jax_sysid_linear": Rival("jax-sysid", "jax-sysid", _NO_PENALTY, environment="jax_sysid"),
-    "octave_arx": _by_octave("Octave arx", f"{_ORDER}, {_ADVANCED}"),
-    "octave_n4sid": _by_octave("Octave n4sid", f"{_STATE}; no delay"),
+    "octave_arx": _by_octave("arx", f"{_ORDER}, {_ADVANCED}"),
+    "octave_n4sid": _by_octave("n4sid", f"{_STATE}; no delay"),
 }

@@ -9,11 +9,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import bilinear, lfilter, lfilter_zi
 
-from benchmarks.rivals.records import current_and_voltage, harmonics, measured_driver
+from benchmarks.rivals.records import current_and_voltage, harmonics
 
 CALLS = 1000  # of the residuals
-
-driver = measured_driver
 
 
 def skin(v_th, v_out, model, start, fs, f0):

@@ -13,14 +13,7 @@ from sippy_unipi import (  # pyright: ignore[reportMissingImports]  # in its own
     system_identification,
 )
 
-from benchmarks.rivals.records import (
-    current_and_voltage,
-    elements,
-    harmonics,
-    measured_driver,
-)
-
-driver = measured_driver
+from benchmarks.rivals.records import current_and_voltage, elements, harmonics
 
 
 def skin(v_th, v_out, model, start, fs, f0):

@@ -1,13 +1,15 @@
 """Runs one rival: `python -m benchmarks.rivals.worker PROBLEM RESULT`.
 
 PROBLEM holds `name`, a module beside this one, run by the Python of its own environment. It has
-`driver` and `skin` for one record, or `batch` for all of a problem at once. Besides: `v_th`,
+`skin` for one record and Z_th as measured, or `fit` for the residuals of `harmonic_fit`, or `batch`
+of an estimator for all of a problem at once. Besides: `v_th`,
 `v_out`, `ref_th`, `ref_out` (draw, sample) [V], `r_ref` (draw,) [ohm], `start` (3,) in SI, `fs`,
 `f0` [Hz], `repeats`, and `budget` [s], after which no further draw is begun, but for the second; a
 first fit that took as long is the only one. RESULT gets the fields of `rivals.Outcome`, `versions`
 and `errors` as JSON.
 """
 
+import functools
 import importlib
 import importlib.metadata
 import json
@@ -18,13 +20,24 @@ import warnings
 
 import numpy as np
 
-from benchmarks.rivals import serve
+from benchmarks.rivals import harmonic_fit, serve
+from benchmarks.rivals.records import measured_driver
+from benchmarks.rivals.roster import RIVALS
 
 FEWEST = 2  # draws
 
 
+def methods(rival):
+    """What identifies a driver and a skin by a rival."""
+    if hasattr(rival, "fit"):
+        each = harmonic_fit.driver, harmonic_fit.skin
+        return [functools.partial(one, rival.fit) for one in each]
+    return measured_driver, rival.skin
+
+
 def results(rival, problem, repeats, budget):
     """All draws, one after the other; what fails costs its own draw alone."""
+    driver, skin = methods(rival)
     fs, f0, start = float(problem["fs"]), float(problem["f0"]), problem["start"]
     draws = len(problem["r_ref"])
     found = {
@@ -43,15 +56,15 @@ def results(rival, problem, repeats, budget):
         try:
             reference = problem["ref_th"][i], problem["ref_out"][i], float(problem["r_ref"][i])
             begin = time.perf_counter()
-            model = rival.driver(*reference, fs, f0)
+            model = driver(*reference, fs, f0)
             found["driver_seconds"][i] = time.perf_counter() - begin
             arguments = (problem["v_th"][i], problem["v_out"][i], model, start, fs, f0)
             runs = []
             if np.isnan(found["first_seconds"]):
-                first = _timed(rival.skin, arguments)
+                first = _timed(skin, arguments)
                 found["first_seconds"] = first[0]
                 runs = [first] if first[0] > budget else []
-            runs = runs or [_timed(rival.skin, arguments) for _ in range(repeats)]
+            runs = runs or [_timed(skin, arguments) for _ in range(repeats)]
             found["seconds"][i] = np.median([seconds for seconds, _ in runs])
             elements, found["ok"][i] = runs[-1][1]
             found["elements"][i] = elements
@@ -71,11 +84,15 @@ def solved(problem):
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     repeats, budget = int(problem.pop("repeats")), float(problem.pop("budget"))
-    rival = importlib.import_module(f"benchmarks.rivals.{problem.pop('name')}")
+    name = str(problem.pop("name"))
+    estimator = RIVALS[name].estimator
+    module = importlib.import_module(f"benchmarks.rivals.{name.removesuffix(f'_{estimator}')}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of trial steps; what comes of them is judged
-        batch = getattr(rival, "batch", None)  # of which the time is short
-        found = batch(problem, repeats) if batch else results(rival, problem, repeats, budget)
+        if estimator:  # of which the time is short
+            found = module.batch(estimator, problem, repeats)
+        else:
+            found = results(module, problem, repeats, budget)
     owners = importlib.metadata.packages_distributions()
     imported = sorted({owner for module in {*sys.modules} & {*owners} for owner in owners[module]})
     versions = {package: importlib.metadata.version(package) for package in imported}

@@ -1,0 +1,128 @@
+"""The machine: where numbers come from, how times are measured, and room for compiled programs.
+
+Beside every row of a CSV stand commit, machine and versions. Times are medians on one core,
+compilation apart.
+"""
+
+import contextlib
+import csv
+import importlib.metadata
+import os
+import pathlib
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+ROOT = pathlib.Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"  # of the last full run, which the README shows
+PACKAGES = ("etid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy", "h5py")
+IMPORTS = 3
+MAPPINGS = 30_000  # half of what Linux allows; one test file needs a few thousand
+
+
+def provenance() -> dict[str, str]:
+    """Commit, machine and versions."""
+    return {
+        "commit": _commit(),
+        "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in PACKAGES},
+    }
+
+
+def _commit() -> str:
+    """The commit, with a + if the working tree differs from it, other than by results of a run."""
+    changed = ["git", "diff", "--name-only", "HEAD", "--", ".", f":!{RESULTS}"]
+    try:
+        commit, names = (
+            subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+            for command in (["git", "rev-parse", "--short=12", "HEAD"], changed)
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return commit.strip() + "+" * bool(names)
+
+
+def _processor() -> str:
+    described = pathlib.Path("/proc/cpuinfo")
+    if described.exists():
+        for line in described.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def write_csv(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows, each with `provenance` unless it has one of an earlier run; no file if none."""
+    if not rows:
+        return path.unlink(missing_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    source = provenance()
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(dict.fromkeys([*rows[0], *source])))
+        writer.writeheader()
+        writer.writerows({**source, **row} for row in rows)
+    return None
+
+
+def pin() -> None:
+    """One core for this process, before JAX counts them."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+@contextlib.contextmanager
+def cores(count: int) -> Iterator[None]:
+    """So many cores, if there are, for the processes that begin here."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    own = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(own)[:count])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, own)
+
+
+def interpreter() -> dict[str, str]:
+    """Environment of an interpreter that keeps its bytecode, as users' interpreters do."""
+    return {name: of for name, of in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+
+
+def import_time(module: str) -> float:
+    """Wall time [s] of importing a module in a fresh interpreter, median after a first one."""
+    code = f"import time; t = time.perf_counter(); {module}; print(time.perf_counter() - t)"
+    command = [sys.executable, "-c", code]
+    runs = [
+        subprocess.run(command, env=interpreter(), capture_output=True, check=True).stdout
+        for _ in range(1 + IMPORTS)
+    ]
+    return float(np.median(np.array(runs[1:], float)))
+
+
+def median_time(call: Callable[[], Any], repeats: int) -> float:
+    """Median wall time [s] after a first call."""
+    runs = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        runs.append(time.perf_counter() - start)
+    return float(np.median(runs[1:]))
+
+
+def make_room() -> None:
+    """Forget what was compiled before the process runs out of mappings.
+
+    XLA maps memory for every executable, and beyond the 65 530 mappings that Linux allows a process
+    the compiler crashes: one process would, that runs all tests, or all cells of a map.
+    """
+    maps = pathlib.Path("/proc/self/maps")
+    if maps.exists() and maps.read_text().count("\n") > MAPPINGS:
+        jax.clear_caches()
