@@ -16,8 +16,10 @@ from etid.estimators.joint.terms import Joint
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.estimators.starts import harmonic_starts
-from etid.online import changes, electrode, gain_bands
+from etid.identify.one import known_at
+from etid.online import alarms, gain_bands, tick
 from etid.online.tracker import Tracker
 from etid.recordings.preflight import Inspected
 from etid.report.methods import methods_section
@@ -240,7 +242,9 @@ def test_what_is_known_of_skin_fades_as_a_random_walk_says():
 
 def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
     tracker = tracker_of(2)
-    known, pulses = tracker.known, tracker.pulses(loaded(quiet()))[:6]
+    driver, _ = calibrated()
+    known = known_at(tracker.model.bands.frequency, driver, False, MAXIMUM_LIKELIHOOD)
+    pulses = tracker.pulses(loaded(quiet()))[:6]
     state = followed(tracker, with_noise(pulses, seed=4))
     step = 1e-3  # of a standard deviation of Z_th
 
@@ -252,9 +256,9 @@ def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
             :, :-1
         ]
 
-    def shared(cov):
-        with_it = dataclasses.replace(tracker, known=dataclasses.replace(known, cov=cov))
-        fits = with_it.read(state)
+    def shared(error):
+        model = dataclasses.replace(tracker.model, source_error=error)
+        fits = dataclasses.replace(tracker, model=model).read(state)
         values = np.asarray(fits.circuit.values())
         return fits.fit.shared_cov / values[:, :, None] / values[:, None, :]
 
@@ -263,7 +267,9 @@ def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
 
     by_z = np.stack([slope(z) for z in np.eye(known.mean.size)], axis=-1)
     expected = by_z @ np.asarray(known.cov) @ by_z.transpose(0, 2, 1)
-    found = shared(known.cov) - shared(jnp.zeros_like(known.cov))
+    error = tracker.model.source_error
+    of_x = shared(0 * error)
+    found = shared(error) - of_x
     scale = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
     # Bands are taken as points where the error is computed, and as bands where it is found.
     np.testing.assert_allclose(
@@ -271,7 +277,7 @@ def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
         expected / scale[:, :, None] / scale[:, None, :],
         atol=0.05,
     )
-    assert (np.diagonal(shared(jnp.zeros_like(known.cov)), axis1=1, axis2=2) > 0).all()  # of X
+    assert (np.diagonal(of_x, axis1=1, axis2=2) > 0).all()  # of X
 
 
 # Standard errors. Both weigh the noise of V_th, but not in the same way, and neighbouring bands
@@ -555,9 +561,9 @@ def test_innovations_of_constant_and_wandering_skin_have_the_distribution_of_the
     @jax.vmap
     def step(carry, d):
         estimate, information, mean, cov = carry
-        before = electrode.predicted(information, jnp.asarray(walked))
-        new = changes.Innovation.of(d - estimate, jnp.asarray(spread), before)
-        moving = changes.averaged(mean, cov, new)
+        before = tick.predicted(information, jnp.asarray(walked))
+        new = alarms.Innovation.of(d - estimate, jnp.asarray(spread), before)
+        moving = alarms.averaged(mean, cov, new)
         after = before + told
         estimate = estimate + jnp.linalg.solve(after, jnp.asarray(told) @ new.d)
         carry = estimate, after, moving.d, moving.cov
@@ -574,9 +580,9 @@ def test_innovations_of_constant_and_wandering_skin_have_the_distribution_of_the
 
 
 def test_the_limit_of_the_tests_is_that_of_the_stated_rate_of_false_alarms():
-    limit = changes.limit(3, PULSES)
+    limit = alarms.limit(3, PULSES)
     hourly = 2 * 3600 * PULSES * scipy.stats.chi2.sf(limit, 3)
-    np.testing.assert_allclose(hourly, changes.FALSE_ALARMS, rtol=1e-6)
+    np.testing.assert_allclose(hourly, alarms.FALSE_ALARMS, rtol=1e-6)
 
 
 TEN = 10

@@ -15,7 +15,7 @@ import numpy as np
 
 import etid.identify.amplitudes
 import etid.identify.jointly
-import etid.online.reading  # noqa: F401 - these modules describe their methods
+import etid.online.state  # noqa: F401 - these modules describe their methods
 from etid.circuits.display import quantity
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
