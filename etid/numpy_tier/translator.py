@@ -281,10 +281,10 @@ class Translator:
         return self.call(("scan",), run, state, avals, True, [body])
 
 
-CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint")
+CALLS = ("jit", "pjit", "closed_call", "remat", "checkpoint")
 CUSTOM = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 # The results of a program are put on the device, not what it makes in between.
-SAME = ("copy", "copy_p", "device_put", "optimization_barrier", "stop_gradient")
+SAME = ("copy", "device_put", "optimization_barrier", "stop_gradient")
 SPECIAL: dict[str, Callable[[Translator, Equation, Sequence[Value]], Sequence[Value]]] = {
     **dict.fromkeys((*CALLS, *CUSTOM), Translator.inlined),
     **dict.fromkeys(SAME, lambda _, __, operands: operands),
