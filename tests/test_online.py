@@ -144,7 +144,7 @@ def test_the_tracker_describes_itself_in_a_report():
     tracker = tracker_of(2)
     fits = tracker.read(followed(tracker, tracker.pulses(loaded(scene(4).simulate(seed=5)))))
     told = StudyFits(fits, {}, {})
-    methods = methods_section(told).text
+    methods = methods_section(told).details
     assert "by on-line tracking" in summary(told)
     assert "iterated at each pulse (Bell and Cathey, 1993)" in methods
     for wrong in ("aximum likelihood", "utput error", "Both occurred", "Levenberg"):

@@ -42,12 +42,12 @@ def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
             _points(axis, x, values, errors, of & good, i, condition, hollow=False)
             _points(axis, x, values, errors, of & ~good, i, condition, hollow=True)
         axis.set_yscale("log")
-        plain_ticks(axis.yaxis)
         shown = known
         if (good & known).any():  # an undetermined element may lie decades away
             low, high = values[good & known].min() / 2, values[good & known].max() * 2
             axis.set_ylim(low, high)
             shown = known & (values > low) & (values < high)
+        plain_ticks(axis.yaxis)
         if not shown.all():
             axis.text(
                 0.995, 0.97, f"{(~shown).sum()} without success outside", color=RED, fontsize=8,
