@@ -22,7 +22,6 @@ from etid.estimators import registry
 from etid.files import exporting
 from etid.identify.options import Options
 from etid.report import figures, methods, tables
-from etid.report.html import Table
 from etid.report.waveforms import Recordings, worst
 from etid.results.driver import (
     Calibration,
@@ -264,21 +263,26 @@ def test_spread_of_subjects_and_recordings_and_errors_are_told_apart():
         assert list(one.parts.values())[2:] == pytest.approx([OWN, SHARED])
 
 
-def test_one_recording_of_one_subject_tells_no_spread():
-    fits = fits_of([1.0], ["successful"])
+@pytest.mark.parametrize(
+    ("values", "subjects"),
+    [([1.0], [""]), ([1.0, np.inf], ["a", "b"])],  # the second in a damaged file
+)
+def test_one_recording_and_an_infinite_element_tell_no_spread(values, subjects):
+    fits = fits_of(values, ["successful"] * len(values), subject=np.array(subjects))
     found = tables.components(fits, fits.summary("subject", "condition"))
     for one in found:
-        assert np.isnan(list(one.parts.values())[:2]).all()
+        assert np.isnan(one.parts["between subjects"])
+        assert np.isnan(one.parts["between recordings"])
         assert list(one.parts.values())[2:] == pytest.approx([OWN, SHARED])
     for row in tables.show_components(found, fits.circuit.units()).rows:
         assert row[6:] == ("", "", "1", "2")
 
 
-def test_an_infinite_element_of_a_damaged_file_tells_no_spread():
-    """Warnings are errors."""
-    fits = fits_of([1.0, np.inf], ["successful"] * 2, subject=np.array(["a", "b"]))
-    for one in tables.components(fits, fits.summary("subject", "condition")):
-        assert np.isnan(one.parts["between subjects"])
+def test_a_range_is_rounded_by_its_length():
+    fits = fits_of([0.9995, 1.0005], ["successful"] * 2)
+    found = tables.components(fits, fits.summary("subject", "condition"))
+    rows = tables.show_components(found, fits.circuit.units()).rows
+    assert [row[5] for row in rows][1] == "185.916 … 186.084"
 
 
 def test_the_worst_are_of_every_verdict_and_of_every_reason():
@@ -296,22 +300,20 @@ def test_the_worst_are_of_every_verdict_and_of_every_reason():
     assert list(worst(fits_of([1.0], ["successful"]))) == [0]
 
 
-def test_an_endless_label_is_drawn_without_a_warning():
-    fits = fits_of(np.ones(3), ["successful"] * 3, trial=np.array(["1" * 1300, "2", "3"]))
+def test_any_labels_and_elements_without_success_are_drawn_without_a_warning(tmp_path):
+    """The font of the pictures lacks some letters, and only successful fits are positive.
+
+    A resistor has no C_p, and Steiglitz-McBride gives negative elements; both say so.
+    """
+    subjects = np.array(["\u88ab\u9a13\u8005", "\u0633", "s" * 1300, "s01"])
+    verdicts = ["successful", "successful", "insensitive", "unstable"]
+    fits_of([1.0, 1.1, 0.0, -3e4], verdicts, subject=subjects, trial=subjects).write(
+        tmp_path / "fits.h5"
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert b"<svg" in figures.each_fit(fits)
-
-
-@pytest.mark.parametrize("value", [0.0, -3e4])
-def test_only_successful_fits_need_positive_elements(tmp_path, value):
-    """A resistor has no C_p, and Steiglitz-McBride gives negative elements; both say so."""
-    verdicts = ["successful", "insensitive", "unstable"]
-    fits_of([1.0, value, value], verdicts).write(tmp_path / "fits.h5")
-    again = etid.Fits.read(tmp_path / "fits.h5")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        etid.write_report(again, tmp_path / "page.html")
+        etid.write_report(etid.Fits.read(tmp_path / "fits.h5"), tmp_path / "page.html")
+    assert str(subjects[0]) in _Read(tmp_path / "page.html").text
 
 
 def test_a_file_with_an_element_of_zero_is_refused(tmp_path):
@@ -355,14 +357,6 @@ def test_no_success_at_all_and_no_fit_at_all(tmp_path):
     assert "No fit is successful" in _Read(tmp_path / "page.html").text
     with pytest.raises(ValueError, match="no fit to report on"):
         etid.write_report(fits_of(np.ones(0), []), tmp_path / "page.html")
-
-
-def test_labels_in_any_script_give_no_warning(tmp_path):
-    """Warnings are errors in tests; the font of the pictures lacks these letters."""
-    subjects = np.array(["\u88ab\u9a13\u8005", "\u0633"])
-    fits = fits_of([1.0, 1.1], ["successful"] * 2, subject=subjects)
-    etid.write_report(fits, tmp_path / "page.html")
-    assert str(subjects[0]) in _Read(tmp_path / "page.html").text
 
 
 def test_every_recording_has_a_row_with_a_link_to_its_waveform(page, found):
@@ -423,11 +417,6 @@ def test_another_circuit_is_reported_as_itself(tmp_path):
     assert "r_s" not in text
 
 
-def test_groups_of_headings_must_cover_the_table():
-    with pytest.raises(ValueError, match="span 1 columns of 2"):
-        Table(("a", "b"), (), (("x", 1),))
-
-
 # --- methods --------------------------------------------------------------------------------------
 
 CITED = {  # what a reader sees, and the key of the entry that it must have
@@ -445,6 +434,16 @@ CITED = {  # what a reader sees, and the key of the entry that it must have
 
 
 TWO = "maximum_likelihood + output_error"
+
+
+def test_the_methods_are_told_in_120_words_and_in_full_behind_them(found, page):
+    section = methods.methods_section(found)
+    assert len(section.text.split()) <= 120
+    for words in ("maximum likelihood", "SkinRC", "order 3", "98.8 kΩ", "4 fits (66.7 %)"):
+        assert words in section.text
+    brief, full = page.read_text("utf-8").split("<summary>In full</summary>")
+    assert "order 3" in brief
+    assert section.code.splitlines()[0] in full
 
 
 def test_methods_say_that_the_calibrations_chose_the_order(found, study_file):
