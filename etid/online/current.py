@@ -25,8 +25,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.online.pulse_fit import GainModel
-from etid.signals.harmonics import real_parts
+from etid.online.pulse_fit import GainModel, first_largest
 from etid.signals.transfer import reciprocal
 
 EDGE = 24  # [samples] after each edge that are looked at in steps of `FINE`
@@ -59,8 +58,6 @@ class CurrentModel(eqx.Module):
         source_error: Errors of log Z_th by the calibrations, as in `GainModel`.
         sums: Weights w of the admittance in Re Σ w Y: row 0 for the charge [C Ω], the others for
             the current at `times` [A Ω].
-        search: Rows 1 and following of `sums` as columns, real parts above negative imaginary
-            parts, in single precision. They find the time of the peak in half the time.
         times: Times of the other rows after the start of the window [s].
         phase: Duration of a phase, t₁ − t₀ [s].
         rest: Upper bound of the charge of a pulse after a pause, relative to `Current.charge`.
@@ -70,7 +67,6 @@ class CurrentModel(eqx.Module):
     source: Complex[Array, " band"]
     source_error: Complex[Array, "z band"]
     sums: Complex[Array, "row band"]
-    search: Float[Array, "part time"]
     times: Float[Array, " time"]
     phase: float = eqx.field(static=True)
     rest: float = eqx.field(static=True)
@@ -97,7 +93,6 @@ class CurrentModel(eqx.Module):
             source=pulses.source,
             source_error=pulses.source_error,
             sums=jnp.asarray(by_band),
-            search=jnp.asarray(np.concatenate([by_band.real, -by_band.imag], axis=1)[1:].T, "f4"),
             times=jnp.asarray(times / rate),
             phase=float((end - begin) / rate),
             rest=float(bands.samples / (bands.samples - (end - begin))),
@@ -142,10 +137,7 @@ class CurrentModel(eqx.Module):
 
         z, pulled = jax.vjp(load, logs)
         admittance = reciprocal(z + self.source)
-        current = jnp.abs(real_parts(admittance).astype(self.search.dtype) @ self.search)
-        # XLA takes five times as long for the argument of a maximum.
-        number = jnp.arange(current.size, dtype=current.dtype)
-        at = jnp.min(jnp.where(current == current.max(), number, number[-1])).astype(int)
+        at = first_largest(jnp.abs(_real(self.sums[1:], admittance)))
         rows = jnp.stack([self.sums[0], self.sums[1 + at]])
         # The rows times Y, not the derivatives: all electrodes have the same `source_error`.
         rows = rows * admittance[None, :]
