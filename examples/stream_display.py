@@ -177,7 +177,7 @@ class Log:
             data.resize(len(data) + 1, axis=0)
             data[-1] = value
 
-    def tell(self, change: etid.online.changes.Change) -> None:
+    def tell(self, change: etid.online.state.Change) -> None:
         """Append a change."""
         self.changes.resize(len(self.changes) + 1, axis=0)
         self.changes[-1] = str(change)

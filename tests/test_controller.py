@@ -69,7 +69,7 @@ def test_the_standard_error_of_the_charge_is_what_other_calibrations_and_noise_m
     model, circuit = controller.model, etid.SkinRC(*dataclasses.astuple(DRY))
     logs, step = circuit.log_values(), 1e-5
     nothing = jnp.zeros((3, 3))
-    alone = dataclasses.replace(model, source_cov=0 * model.source_cov)
+    alone = dataclasses.replace(model, source_error=0 * model.source_error)
     current = eqx.filter_jit(alone.current)
     for i in range(3):
         low, high = (
@@ -78,11 +78,11 @@ def test_the_standard_error_of_the_charge_is_what_other_calibrations_and_noise_m
         one = current(circuit, logs, nothing.at[i, i].set(1.0))
         # A central difference of a smooth function: error of the order of step².
         np.testing.assert_allclose(one.charge_stderr, abs(high - low) / 2 / step, rtol=1e-6)
-    cov = jnp.zeros_like(model.source_cov).at[0, 0].set(1.0)
-    one = dataclasses.replace(model, source_cov=cov).current(circuit, logs, nothing)
+    first = dataclasses.replace(model, source_error=model.source_error[:1])
+    one = first.current(circuit, logs, nothing)
     # I = X (1 - G) / Z_th with G fixed: the admittance changes by -δ log Z_th.
     admittance = 1 / (circuit.response(model.frequency) + model.source)
-    parts = admittance * model.by_source[0]
+    parts = admittance * model.source_error[0]
     shift = (model.sums[0] @ parts).real
     np.testing.assert_allclose(one.charge_stderr, jnp.abs(shift), rtol=1e-9)
 
@@ -176,7 +176,8 @@ def test_the_cap_of_the_estimate_holds_as_often_as_it_should():
     draws, rng = 300, np.random.default_rng(5)
     logs = state.electrodes.own[1, :3]
     cov = np.linalg.inv(np.asarray(state.electrodes.information[1]))
-    model = dataclasses.replace(controller.model, source_cov=0 * controller.model.source_cov)
+    model = controller.model
+    model = dataclasses.replace(model, source_error=0 * model.source_error)
     circuit = controller.tracker.model.circuit
     true = float(eqx.filter_jit(model.current)(circuit, logs, jnp.zeros((3, 3))).charge)
     drawn = np.asarray(logs)[None, :] + rng.standard_normal((draws, 3)) @ np.linalg.cholesky(cov).T

@@ -128,11 +128,11 @@ def test_options_are_fields_which_fits_and_their_methods_section_keep(study):
     fits = etid.identify_skins(study.loaded, driver, circuit=Resistor(), method=asked)
     assert fits.fit.method == "proportion(offset=False)"
     assert registry.named(fits.fit.method) == asked
-    assert "the mean kept" in methods_section(StudyFits(fits, {}, {})).text
+    assert "the mean kept" in methods_section(StudyFits(fits, {}, {})).details
     usual = etid.identify_skins(study.loaded, driver, circuit=Resistor(), method="proportion")
     both = etid.Fits.concatenate([fits, usual])
     assert both.fit.method == "proportion + proportion(offset=False)"
-    text = methods_section(StudyFits(both, {}, {})).text
+    text = methods_section(StudyFits(both, {}, {})).details
     assert "the mean kept" in text
     assert "the mean taken out" in text
 
@@ -157,7 +157,7 @@ def test_the_instance_of_a_name_is_the_same_method(study):
     fits = etid.identify_skins(records, driver, method=few)
     assert fits.fit.method == str(few) == "steiglitz_mcbride(iterations=3)"
     assert int(np.max(fits.fit.steps)) < 3
-    assert "by at most 3 iterations" in methods_section(StudyFits(fits, {}, {})).text
+    assert "by at most 3 iterations" in methods_section(StudyFits(fits, {}, {})).details
 
 
 @pytest.mark.usefixtures("_registered")
@@ -168,7 +168,7 @@ def test_what_no_module_has_registered_is_not_described(study):
     unknown = dataclasses.replace(fits, fit=dataclasses.replace(fits.fit, method="by_hand"))
     section = methods_section(StudyFits(unknown, {}, {}))
     assert "The estimator 'by_hand' is not registered" in section.warning
-    assert not re.search("likelihood|output error|Steiglitz", section.text)
+    assert not re.search("likelihood|output error|Steiglitz", section.details)
 
 
 @pytest.mark.parametrize(

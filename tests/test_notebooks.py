@@ -12,7 +12,7 @@ import warnings
 import nbformat
 import pytest
 
-from etid.numpy_tier.waiting import COMPILING
+from etid.numpy_tier.tiers import COMPILING
 from tests.conftest import REFERENCE_DATA
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")

@@ -172,9 +172,6 @@ def test_the_slope_by_a_number_that_is_made_complex_is_real():
         (jnp.argmax, (*REAL, np.int32)),
         (jnp.argmin, REAL),
         (jnp.cumsum, (*REAL, np.int32)),
-        (jnp.cumprod, REAL),
-        (lax.cummax, REAL),
-        (lax.cummin, REAL),
         (lambda x, axis: lax.cumsum(x, axis, reverse=True), REAL),
         (jnp.sort, (*NUMBERS, np.bool_)),
         (jnp.argsort, NUMBERS),
@@ -185,9 +182,8 @@ def test_a_function_along_an_axis(function, dtypes):
     for dtype, axis in itertools.product(dtypes, range(3)):
         drawn = rng.choice(every(dtype, finite=True), (4, 3, 5))  # with equal ones among them
         check(functools.partial(function, axis=axis), drawn, rounding=8)
-    if function is not jnp.cumprod:  # of which 0 times infinity depends on the order
-        gaps = np.where(rng.random((4, 3, 5)) < 0.3, np.nan, 1.0).astype(dtypes[0])
-        check(functools.partial(function, axis=0), gaps)
+    gaps = np.where(rng.random((4, 3, 5)) < 0.3, np.nan, 1.0).astype(dtypes[0])
+    check(functools.partial(function, axis=0), gaps)
 
 
 def test_reductions_of_nothing():
@@ -256,7 +252,6 @@ LOOKED_UP = {
     "a diagonal": lambda x, at: jnp.diagonal(x, axis1=0, axis2=2),
     "set": lambda x, at: x.at[at[:, 0], :, at[:, 1]].set(0.5),
     "added": lambda x, at: x.at[at].add(x[:1] * 2),
-    "multiplied": lambda x, at: x.at[at % 2].multiply(3.0),
     "set, clipped": lambda x, at: x.at[at[:1, 1]].set(-1.0, mode="clip"),
     "set in windows": lambda x, at: x.at[:, 1:3, 2].set(jnp.arange(2.0)),
     "each set": lambda x, at: jax.vmap(lambda x, i: x.at[i].set(0.0))(x, at[:, 1]),
@@ -336,14 +331,6 @@ def test_factors_of_an_empty_matrix_are_found_without_a_word(capfd):
     for shape in ((0, 0), (2, 0, 0)):
         check(ALGEBRA["lu"], np.zeros(shape))
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_function_of_python_gets_and_gives_arrays():
-    def sines(x):
-        return jax.pure_callback(np.sin, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
-
-    check(sines, X)
-    check(sines, np.float64(0.5))
 
 
 @pytest.mark.parametrize(

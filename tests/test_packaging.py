@@ -1,9 +1,12 @@
-"""What is said of the package in several places, and what it ships."""
+"""What is said of the package in several places, what it ships, and what importing it does."""
 
 import importlib.metadata
 import pathlib
 import re
+import subprocess
+import sys
 import tomllib
+import types
 
 import pytest
 import yaml
@@ -74,3 +77,29 @@ def test_dependencies_have_lower_bounds_and_exact_versions_in_the_constraints(pr
         name, bound = requirement.split(">=")
         assert bound[0].isdigit()
         assert name.lower() in pinned, f"{name} is not in constraints.txt"
+
+
+def test_importing_prints_nothing_and_changes_no_setting():
+    code = """
+import jax
+before = dict(jax.config.values)
+import sys, etid
+etid.read
+from jax._src import xla_bridge
+assert dict(jax.config.values) == before
+assert not {"matplotlib", "pandas", "jaxopt", "pyarrow", "pynwb"} & set(sys.modules), "too much"
+assert not xla_bridge._backends, "JAX has started: a later choice of its platform would be lost"
+slow = {f"scipy.{part}" for part in ("fft", "interpolate", "optimize", "special", "stats")}
+assert not slow & set(sys.modules), "scipy loads its parts when they are used: import scipy"
+"""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_dir_shows_the_public_names_and_no_module():
+    shown = dir(etid)
+    assert shown == sorted(etid.__all__)
+    modules = {name for name in shown if isinstance(getattr(etid, name), types.ModuleType)}
+    assert modules == {"scenes"}  # `etid.scenes.paper_skins()` is how its functions are called

@@ -29,9 +29,13 @@ def test_table_sets_words_left_and_numbers_right():
     ]
 
 
-def test_table_refuses_a_row_of_another_length():
-    with pytest.raises(ValueError, match="1 cells for 2 columns"):
-        report.Table(("a", "b"), (("1",),))
+@pytest.mark.parametrize(
+    ("rows", "groups", "message"),
+    [((("1",),), (), "1 cells for 2 columns"), ((), (("x", 1),), "span 1 columns of 2")],
+)
+def test_a_table_refuses_rows_and_headings_that_do_not_cover_it(rows, groups, message):
+    with pytest.raises(ValueError, match=message):
+        report.Table(("a", "b"), rows, groups)
 
 
 class _Balance(html.parser.HTMLParser):
@@ -52,14 +56,17 @@ class _Balance(html.parser.HTMLParser):
 def test_page_is_whole_escaped_and_needs_no_other_file(tmp_path):
     picture = report.Picture("caption <c>", b"<svg xmlns='http://www.w3.org/2000/svg'/>", 'a "b"')
     table = report.Table(("x", "y"), (("<1>", "2"),), (("", 1), ("<g>", 1)), "of <t>")
-    section = report.Section("R < 1", "a & b", (table,), (picture,), "<w>", "@x{<key>}")
+    section = report.Section(
+        "R < 1", "a & `b < c`", (table,), (picture,), "<w>", "in full", "@x{<key>}"
+    )
     report.write_page(tmp_path / "page.html", "Title <t>", "text", [section])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     parser = _Balance()
     parser.feed(page)
     assert parser.open == []
     for escaped in (
-        "Title &lt;t&gt;", "R &lt; 1", "a &amp; b", "&lt;1&gt;", "&lt;g&gt;", "of &lt;t&gt;",
+        "Title &lt;t&gt;", "R &lt; 1", "a &amp; <code>b &lt; c</code>",
+        "&lt;1&gt;", "&lt;g&gt;", "of &lt;t&gt;",
         "caption &lt;c&gt;", "a &#34;b&#34;", "&lt;w&gt;", "@x{&lt;key&gt;}",
     ):  # fmt: skip
         assert escaped in page

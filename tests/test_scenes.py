@@ -1,5 +1,6 @@
 """Synthetic recordings against SPICE, the circuit's differential equations, and closed forms."""
 
+import argparse
 import dataclasses
 import json
 from typing import Any
@@ -11,6 +12,8 @@ import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 
+import etid
+from etid.commands import simulate
 from etid.simulation import scenes, transformer
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import OpenLoad, ResistorLoad, Sampler, SkinLoad, TransformerDriver
@@ -440,6 +443,16 @@ def test_subjects_lie_in_the_published_ranges_and_differ(condition, ranges):
     trials = [t for t in scene.trials if t.condition == condition]
     assert all(t.load == elements[t.subject] for t in trials)
     assert len(trials) == 50
+
+
+@pytest.mark.parametrize("name", ["paper_dry", "paper_damp"])
+def test_the_first_study_of_a_newcomer_has_no_false_alarm(name):
+    """What `etid simulate` makes without options; seed 0 has one recording that is `changed`."""
+    parser = argparse.ArgumentParser()
+    simulate.add_arguments(parser)
+    given = parser.parse_args([name, "-o", "study.h5"])
+    study = scenes.PRESETS[name](snr_db=given.snr_db).simulate(given.seed)
+    assert etid.identify_study(study).fits.counts() == {"successful": 10}
 
 
 # --- mistakes -------------------------------------------------------------------------------------

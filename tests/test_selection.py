@@ -493,7 +493,7 @@ def test_a_file_gets_one_circuit_and_says_that_it_was_chosen(study, tmp_path):
     again = etid.StudyFits.read(tmp_path / "fits.h5")
     assert again.settings is not None
     assert set(again.settings.candidates) == {type(one).__name__ for one in CANDIDATES}
-    assert "It was chosen among ParallelRC, Resistor," in methods_section(again).text
+    assert "It was chosen among ParallelRC, Resistor," in methods_section(again).details
 
 
 @pytest.mark.slow

@@ -4,10 +4,9 @@ XLA takes about 7 ms to compile each kernel of a program, be it large or small. 
 once or a few times on small arrays is therefore done sooner without XLA. `translated` turns a
 jaxpr into the source of one Python function that calls NumPy and SciPy.
 
-- `tiers` decides who runs a function; `waiting` tells a person who waits for XLA.
+- `tiers` decides who runs a function, and tells a person who waits for XLA.
 - `translator` walks over the equations of a jaxpr, and `source` writes the statements.
-- `primitives` has one rule for each primitive, `algebra` those of matrices, and `flow` the loops.
-- `one_thread` keeps BLAS from starting threads.
+- `primitives` has one rule for each primitive, and `algebra` those of matrices.
 
 This package knows nothing of etid's models.
 """

@@ -1,13 +1,22 @@
-"""Linear algebra and Fourier transforms by NumPy and LAPACK, with the results of XLA."""
+"""Linear algebra and Fourier transforms by NumPy and LAPACK, with the results of XLA.
 
+OpenBLAS shares a product of a few thousand multiplications among threads. Those then wait for the
+next product in a busy loop, which takes three quarters of the CPU time of a driver. So BLAS has
+`one_thread` while a small program runs.
+"""
+
+import contextlib
+import functools
 import math
 import operator
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.linalg import blas, lapack
+from threadpoolctl import ThreadpoolController
 
 from etid.numpy_tier.source import UntranslatableError, Value
 
@@ -150,3 +159,30 @@ def fft(p: Any, _: Any, __: Any) -> Any:
     functions = np.fft.fftn, np.fft.ifftn, np.fft.rfftn, np.fft.irfftn
     lengths = p["fft_lengths"]
     return partial(functions[int(p["fft_type"])], s=lengths, axes=range(-len(lengths), 0))
+
+
+_lock = threading.Lock()
+_limits: list[contextlib.AbstractContextManager[object]] = []
+_inside = 0  # programs that run at this time, in all threads
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """BLAS has one thread within, and after the last of several programs as many as before."""
+    global _inside
+    with _lock:
+        if _inside == 0:
+            _limits.append(_blas().limit(limits=1))
+        _inside += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _inside -= 1
+            if _inside == 0:
+                _limits.pop().__exit__(None, None, None)
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController().select(user_api="blas")

@@ -236,10 +236,10 @@ def reduction(function: Any, p: Any, operands: Sequence[Value], _: Any) -> Any:
     return partial(function.reduce, axis=axes, **options) if axes else 0
 
 
-def running(function: Any, of: Any, axis: int, reverse: bool) -> Any:
-    """Sums, or the like, of all elements up to each."""
+def running_sum(of: Any, axis: int, reverse: bool) -> Any:
+    """Sums of all elements up to each."""
     order = (*[slice(None)] * axis, slice(None, None, -1 if reverse else 1))
-    return function.accumulate(of[order], axis, of.dtype)[order]
+    return np.cumsum(of[order], axis, of.dtype)[order]
 
 
 def window_sum(p: Any, operands: Sequence[Value], _: Any) -> Any:
@@ -340,31 +340,15 @@ def dynamic_update_slice(of: Any, new: Any, *starts: Any) -> Any:
     return found
 
 
-def called(p: Any, _: Any, results: Sequence[Any]) -> Any:
-    """The rule of a function of Python, which gets and gives arrays."""
-
-    def call(*of: Any) -> list[Any]:
-        found = p["callback"](*map(np.asarray, of))
-        return [np.asarray(one, aval.dtype) for one, aval in zip(found, results, strict=True)]
-
-    return call
-
-
 # --- All of them ----------------------------------------------------------------------------------
 
 RULES: dict[str, Rule] = {
     **ELEMENTWISE,
-    **dict.fromkeys(
-        ("empty", "empty2"), lambda _, __, out: lambda *_: np.zeros(out[0].shape, out[0].dtype)
-    ),
     "argmax": by_keywords(lambda of, axes, index_dtype: of.argmax(axes[0]).astype(index_dtype)),
     "argmin": by_keywords(lambda of, axes, index_dtype: of.argmin(axes[0]).astype(index_dtype)),
     "cholesky": always(algebra.cholesky),
     "concatenate": by_keywords(lambda *of, dimension: np.concatenate(of, dimension)),
-    "cummax": by_keywords(partial(running, np.maximum)),
-    "cummin": by_keywords(partial(running, np.minimum)),
-    "cumprod": by_keywords(partial(running, np.multiply)),
-    "cumsum": by_keywords(partial(running, np.add)),
+    "cumsum": by_keywords(running_sum),
     "dot_general": algebra.product,
     "dynamic_slice": by_keywords(
         lambda of, *starts, slice_sizes: of[window(of, slice_sizes, starts)]
@@ -372,6 +356,7 @@ RULES: dict[str, Rule] = {
     "dynamic_update_slice": always(dynamic_update_slice),
     "eig": algebra.eig,
     "eigh": algebra.eigh,
+    "empty2": lambda _, __, out: lambda *_: np.zeros(out[0].shape, out[0].dtype),
     "fft": algebra.fft,
     "gather": gather,
     "iota": lambda p, _, out: lambda *_: np.indices(out[0].shape, out[0].dtype)[p["dimension"]],
@@ -380,7 +365,6 @@ RULES: dict[str, Rule] = {
     "platform_index": by_keywords(
         lambda platforms: np.int32([not names or "cpu" in names for names in platforms].index(True))
     ),
-    "pure_callback": called,
     "qr": algebra.qr,
     "reduce_and": partial(reduction, np.bitwise_and),
     "reduce_max": partial(reduction, np.maximum),
@@ -392,7 +376,6 @@ RULES: dict[str, Rule] = {
     "rev": by_keywords(lambda of, dimensions: np.flip(of, dimensions)),
     "scatter": scatter,
     "scatter_add": partial(scatter, function=np.add),
-    "scatter_mul": partial(scatter, function=np.multiply),
     "slice": slices,
     "sort": by_keywords(sort),
     "split": split,

@@ -7,18 +7,20 @@ traced programs in a fifth of a second and in 10 ms, and nothing is compiled.
 import contextlib
 import functools
 import logging
+import sys
+import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.core
+from tqdm import tqdm
 
 from etid.garbage import unsearched
 from etid.numpy_tier.source import UntranslatableError
 from etid.numpy_tier.translator import translated
-from etid.numpy_tier.waiting import announced
 from etid.precision import in_float64, is_traced
 
 Parameters = ParamSpec("Parameters")
@@ -43,7 +45,11 @@ AT_ONCE = {
 # and longer in proportion for samples: from about 400 such skins on, XLA is sooner.
 WORTH_COMPILING = 400 * 1728
 
+PATIENCE = 1.0  # [s] waiting time without a word
+COMPILING = "etid: JAX compiles the fit, once in each process."
+
 _log = logging.getLogger(__name__)
+_told = threading.Event()  # that JAX compiles
 _programs: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
 
 
@@ -127,7 +133,7 @@ def _by_numpy() -> bool:
 
 def _by_xla(run: Any, static: _Static, arrays: Any) -> Any:
     """What XLA computes, once it has compiled the function."""
-    with announced(), unsearched():
+    with _announced(), unsearched():
         return run(static, arrays)
 
 
@@ -155,3 +161,22 @@ def _at_once() -> contextlib.AbstractContextManager[None]:
     compiled as a program of its own. A driver and a skin have three hundred, which take 14 s.
     """
     return jax.ensure_compile_time_eval() if is_traced(()) else contextlib.nullcontext()
+
+
+@contextlib.contextmanager
+def _announced() -> Iterator[None]:
+    """Tell a person on a terminal or in a notebook who waits: one line, once in each process."""
+    timer = threading.Timer(PATIENCE, _tell)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _tell() -> None:
+    person = sys.stderr is not None and (sys.stderr.isatty() or "ipykernel" in sys.modules)
+    if person and not _told.is_set():
+        _told.set()
+        tqdm.write(COMPILING, file=sys.stderr)  # not into a progress bar

@@ -17,10 +17,18 @@ import numpy as np
 from jax import ShapeDtypeStruct
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from etid.numpy_tier import flow
-from etid.numpy_tier.one_thread import one_thread
+from etid.numpy_tier.algebra import one_thread
 from etid.numpy_tier.primitives import ELEMENTWISE, RULES, filled
-from etid.numpy_tier.source import Body, Statement, UntranslatableError, Value
+from etid.numpy_tier.source import (
+    Body,
+    Statement,
+    UntranslatableError,
+    Value,
+    branch,
+    repeat,
+    repeat_lanes,
+    scan,
+)
 
 Equation = Any  # a `JaxprEqn`, whose values are arrays
 
@@ -247,7 +255,7 @@ class Translator:
             return self.inline(branches[np.clip(which.constant, 0, len(branches) - 1)], own)
         bodies = [self.nested(of, own, []) for of in branches]
         avals = branches[0].out_avals
-        return self.call(("cond",), flow.branch, [which], avals, True, bodies)
+        return self.call(("cond",), branch, [which], avals, True, bodies)
 
     def loop(self, equation: Equation, operands: Sequence[Value]) -> Sequence[Value]:
         """Results of a loop of unknown length."""
@@ -258,7 +266,7 @@ class Translator:
             self.nested(goes_on, operands[:first], avals, 1),
             self.nested(params["body_jaxpr"], operands[first:second], avals, 1),
         ]
-        run = flow.repeat_lanes if goes_on.out_avals[0].shape else flow.repeat
+        run = repeat_lanes if goes_on.out_avals[0].shape else repeat
         state = self.all_full(operands[second:], avals)
         return self.call(("repeat",), run, state, avals, True, bodies)
 
@@ -268,15 +276,15 @@ class Translator:
         first, count, program = params["num_consts"], params["num_carry"], params["jaxpr"]
         body = self.nested(program, operands[:first], program.in_avals[first:], 1)
         steps = range(params["length"])[:: -1 if params["reverse"] else 1]
-        run = partial(flow.scan, steps=steps, length=count, avals=avals[count:])
+        run = partial(scan, steps=steps, length=count, avals=avals[count:])
         state = self.all_full(operands[first:], (var.aval for var in equation.invars[first:]))
         return self.call(("scan",), run, state, avals, True, [body])
 
 
-CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint")
+CALLS = ("jit", "pjit", "closed_call", "remat", "checkpoint")
 CUSTOM = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 # The results of a program are put on the device, not what it makes in between.
-SAME = ("copy", "copy_p", "device_put", "optimization_barrier", "stop_gradient")
+SAME = ("copy", "device_put", "optimization_barrier", "stop_gradient")
 SPECIAL: dict[str, Callable[[Translator, Equation, Sequence[Value]], Sequence[Value]]] = {
     **dict.fromkeys((*CALLS, *CUSTOM), Translator.inlined),
     **dict.fromkeys(SAME, lambda _, __, operands: operands),

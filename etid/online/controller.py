@@ -212,7 +212,7 @@ class Controller(Overviewed):
                 "the driver of the tracker was not identified successfully, so that no limit of "
                 "the current would hold; repeat the calibration"
             )
-        model = CurrentModel.of(tracker.model.bands, tracker.model.source, tracker.known)
+        model = CurrentModel.of(tracker.model)
         most = float(current_cap) * model.phase
         if most < charge_cap < math.inf:
             raise ValueError(

@@ -25,10 +25,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.online.gain_bands import Bands
-from etid.signals.harmonics import real_parts
-from etid.signals.transfer import as_complex, reciprocal
+from etid.online.pulse_fit import GainModel, first_largest
+from etid.signals.transfer import reciprocal
 
 EDGE = 24  # [samples] after each edge that are looked at in steps of `FINE`
 FINE = 0.5  # [samples]
@@ -57,12 +55,9 @@ class CurrentModel(eqx.Module):
     Attributes:
         frequency: Centres of the bands [Hz].
         source: Z_th in each band [Ω].
-        by_source: ∂ log Z_th / ∂z for the directions z of the calibrations' errors.
-        source_cov: Covariance of z.
+        source_error: Errors of log Z_th by the calibrations, as in `GainModel`.
         sums: Weights w of the admittance in Re Σ w Y: row 0 for the charge [C Ω], the others for
             the current at `times` [A Ω].
-        search: Rows 1 and following of `sums` as columns, real parts above negative imaginary
-            parts, in single precision. They find the time of the peak in half the time.
         times: Times of the other rows after the start of the window [s].
         phase: Duration of a phase, t₁ − t₀ [s].
         rest: Upper bound of the charge of a pulse after a pause, relative to `Current.charge`.
@@ -70,25 +65,16 @@ class CurrentModel(eqx.Module):
 
     frequency: Float[Array, " band"]
     source: Complex[Array, " band"]
-    by_source: Complex[Array, "z band"]
-    source_cov: Float[Array, "z z"]
+    source_error: Complex[Array, "z band"]
     sums: Complex[Array, "row band"]
-    search: Float[Array, "part time"]
     times: Float[Array, " time"]
     phase: float = eqx.field(static=True)
     rest: float = eqx.field(static=True)
 
     @classmethod
-    def of(
-        cls, bands: Bands, source: Complex[Array, " band"], known: GivenDriver
-    ) -> "CurrentModel":
-        """The model.
-
-        Args:
-            bands: The unloaded pulse.
-            source: Z_th in its bands [Ω].
-            known: Distribution of Z_th in its bands.
-        """
+    def of(cls, pulses: GainModel) -> "CurrentModel":
+        """The currents of the pulses whose gains a tracker fits."""
+        bands = pulses.bands
         x, rate = np.asarray(bands.x), bands.sample_rate
         number = np.arange(1.0, x.size + 1)
         v = bands.waveform()
@@ -102,14 +88,11 @@ class CurrentModel(eqx.Module):
         rows = np.concatenate([integral[None, :], np.exp(1j * np.outer(times, omega))])
         rows = 2 / bands.samples * rows * x
         by_band = rows @ _interpolation(number, np.asarray(bands.frequency) * bands.samples / rate)
-        loaded = source + as_complex(known.resistance)
         return cls(
             frequency=bands.frequency,
-            source=source,
-            by_source=known.slope * (loaded * reciprocal(source))[None, :],
-            source_cov=known.cov,
+            source=pulses.source,
+            source_error=pulses.source_error,
             sums=jnp.asarray(by_band),
-            search=jnp.asarray(np.concatenate([by_band.real, -by_band.imag], axis=1)[1:].T, "f4"),
             times=jnp.asarray(times / rate),
             phase=float((end - begin) / rate),
             rest=float(bands.samples / (bands.samples - (end - begin))),
@@ -131,8 +114,8 @@ class CurrentModel(eqx.Module):
             quantile: Standard errors by the calibrations that are added.
         """
         row = self.sums[:1] * reciprocal(self.source)[None, :]
-        shift = _real(row, self.by_source.T)[0]
-        stderr = jnp.sqrt(shift @ self.source_cov @ shift)
+        shift = _real(row, self.source_error.T)[0]
+        stderr = jnp.sqrt(shift @ shift)
         return self.rest * (row.real.sum() + quantile * stderr)
 
     def current(
@@ -154,19 +137,16 @@ class CurrentModel(eqx.Module):
 
         z, pulled = jax.vjp(load, logs)
         admittance = reciprocal(z + self.source)
-        current = jnp.abs(real_parts(admittance).astype(self.search.dtype) @ self.search)
-        # XLA takes five times as long for the argument of a maximum.
-        number = jnp.arange(current.size, dtype=current.dtype)
-        at = jnp.min(jnp.where(current == current.max(), number, number[-1])).astype(int)
+        at = first_largest(jnp.abs(_real(self.sums[1:], admittance)))
         rows = jnp.stack([self.sums[0], self.sums[1 + at]])
-        # The rows times Y, not the derivatives: `by_source` is the same matrix at all electrodes.
+        # The rows times Y, not the derivatives: all electrodes have the same `source_error`.
         rows = rows * admittance[None, :]
         charge, peak = rows.real.sum(axis=1)
-        shared = _real(rows, self.by_source.T)
+        shared = _real(rows, self.source_error.T)
         # Re Σ row Y² ∂Z/∂ϑ
         (own,) = jax.vmap(pulled)(rows * admittance[None, :])
         variance = jnp.sum((own @ cov) * own, axis=1)
-        variance = variance + jnp.sum((shared @ self.source_cov) * shared, axis=1)
+        variance = variance + jnp.sum(shared**2, axis=1)
         charge_stderr, peak_stderr = jnp.sqrt(variance)
         return Current(charge, charge_stderr, jnp.abs(peak), peak_stderr)
 

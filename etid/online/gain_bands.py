@@ -29,7 +29,6 @@ this part is 0.2 % of the pulse, which is far above the noise.
 """
 
 import math
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -78,20 +77,6 @@ def _edges(bins: int) -> Int[np.ndarray, " band1"]:
         width = min(max(first[-1] // RELATIVE, 1), WIDEST)
         first.append(min(first[-1] + width, inner))
     return np.array([*first, bins + 1])
-
-
-class Gains(NamedTuple):
-    """The measured gain of one pulse.
-
-    Attributes:
-        gain: Ĝ in each band; it includes the phase of the trigger delay.
-        variance: E|noise|² of a Fourier coefficient of V_out [V²].
-        weight: Weight of |Ĝ − G|².
-    """
-
-    gain: Complex[Array, "lane band"]
-    variance: Float[Array, " lane"]
-    weight: Float[Array, "lane band"]
 
 
 class Bands(eqx.Module):
@@ -156,19 +141,22 @@ class Bands(eqx.Module):
 
     def measure(
         self, seen: Seen, lacking: Float[Array, " lane"], offset: Float[Array, " lane"]
-    ) -> Gains:
-        """Gains and noise of one pulse at all electrodes, as if its amplitude had been constant.
+    ) -> tuple[Complex[Array, "lane band"], Float[Array, "lane band"]]:
+        """Gains of one pulse at all electrodes, as if its amplitude had been constant.
 
         Args:
             seen: The bands of the windows.
             lacking: (A − B) / A, for a pulse of amplitude A after one of amplitude B.
             offset: Offset of the converter [V].
+
+        Returns:
+            Ĝ in each band, with the phase of the trigger delay, and the weight of |Ĝ − G|².
         """
         gain = seen.gain()
         tail = self._lacking_tail(seen, lacking, offset)
         unsure = self.weight[None, :] * power(TAIL_ERROR * tail) / 2
         weight = self.weight[None, :] / (seen.variance[:, None] + unsure)
-        return Gains(gain + tail, jnp.asarray(seen.variance), weight)
+        return gain + tail, weight
 
     def _lacking_tail(
         self, seen: Seen, lacking: Float[Array, " lane"], offset: Float[Array, " lane"]

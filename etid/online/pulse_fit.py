@@ -132,6 +132,12 @@ class GainModel(eqx.Module):
         return z * reciprocal(z + self.source)
 
 
+def first_largest(values: Float[Array, " value"]) -> Int[Array, ""]:
+    """Number of the largest value, as of `argmax`, for which XLA takes five times as long."""
+    number = jnp.arange(values.size)
+    return jnp.min(jnp.where(values == values.max(), number, values.size - 1))
+
+
 def nearest_delay(
     model: GainModel, gain: Complex[Array, " band"], expected: Complex[Array, " band"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -142,16 +148,14 @@ def nearest_delay(
     product = as_complex(model.bands.weight) * jnp.conj(expected) * gain
     turns = jnp.concatenate([model.turns.real, -model.turns.imag], axis=1)
     alike = turns @ jnp.concatenate([product.real, product.imag])
-    largest = alike.max()
-    # XLA takes five times as long for the argument of a maximum.
-    at = jnp.min(jnp.where(alike == largest, jnp.arange(DELAYS.size), DELAYS.size - 1))
+    at = first_largest(alike)
     # A parabola through three values: a step of the grid, 0.1 samples, is a hundred standard
     # errors.
     around = alike[jnp.clip(at, 1, DELAYS.size - 2) + jnp.arange(-1, 2)]
     curved = around[0] - 2 * around[1] + around[2]
     delay = DELAYS[0] + STEP * (at.astype(around.dtype) + 0.5 * (around[0] - around[2]) / curved)
     inside = (at > 0) & (at < DELAYS.size - 1) & (curved < 0)
-    distance = jnp.sum(model.bands.weight * power(expected)) - 2 * largest
+    distance = jnp.sum(model.bands.weight * power(expected)) - 2 * alike.max()
     return jnp.where(inside, delay, jnp.asarray(DELAYS)[at]), distance
 
 

@@ -1,11 +1,67 @@
-"""The state of a tracker: what it knows about every electrode after a pulse."""
+"""The state of a tracker after a pulse, and what it says: fits, changes, electrodes to repair."""
+
+import dataclasses
+import math
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.overview import Overview, Overviewed
-from etid.results.verdicts import RESULTS, counted, verdict_names
+from etid.estimators.estimator import Description
+from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
+from etid.estimators.registry import register_description
+from etid.estimators.score_tests.other_circuit import MOVED
+from etid.estimators.unknowns import LoadUnknowns
+from etid.online.alarms import SEEN_GAIN
+from etid.online.pulse_fit import DELAYS, GainModel, Pulse
+from etid.results.fit import Fit
+from etid.results.verdicts import RESULTS, counted, first_verdict, verdict_names
+from etid.signals.harmonics import real_parts
+from etid.signals.transfer import as_complex, power
+from etid.solvers.matrices import inverse
+
+METHOD = "online"
+OPEN = 0.99  # effective gain above which an electrode touches nothing
+SHORTED = 0.02  # effective gain below which an electrode is shorted
+DRY = 700e3  # [Ω] at the lowest frequency; the driest fingertip of the paper's Table II has 686 kΩ
+RECENT = 60  # pulses for which an electrode that has drifted is called drifting
+NONE, JUMP, DRIFT = range(3)
+KINDS = ("none", "jump", "drift")
+
+register_description(
+    METHOD,
+    Description(
+        words="on-line tracking",
+        text="The loads were identified on-line, anew with each pulse, by an extended Kalman "
+        "filter in information form, iterated at each pulse (Bell and Cathey, 1993). In bands of "
+        "frequency of each pulse, the ratio of the loaded to the unloaded voltage was compared "
+        "with Z_L / (Z_L + Z_th) exp(-jωτ), in continuous time and with what has aliased; the "
+        "trigger delay τ of each pulse was one more unknown. The logarithms of the elements follow "
+        "a random walk. After a change (generalised likelihood ratio, Willsky and Jones, 1976, or "
+        "moving mean of the innovations, Lowry et al., 1992) an electrode began anew. Z_th "
+        "is that of the calibrations.",
+        conditions=(
+            "the last pulse passed the checks for flat, clipped and missing samples",
+            "its iteration settled",
+            "its residual does not exceed the noise (χ² per degree of freedom of at most "
+            f"{MISFIT_CHI2:g} or of what noise exceeds once in ten million pulses, or an "
+            f"unexplained part of at most {100 * MISFIT_RRSE:g} % of the signal)",
+            "a score test, summed over the pulses since the electrode began anew, finds no "
+            "difference between the gains of the two records that moves an element by "
+            f"{100 * MOVED:g} % (at most {SEEN_GAIN:g} standard deviations)",
+            f"its trigger delay is at most {DELAYS[-1]:g} samples",
+            "no change of the driver was seen since the calibrations",
+            "every relative standard error is below 1",
+        ),
+        errors="accumulate the information of all pulses; to them the error of Z_th and of the "
+        "unloaded voltage was added, which no number of pulses lessens",
+        noise="The variance of the noise was estimated at each pulse from the quiet between two "
+        "pulses, at six frequencies and without a parabola through each block.",
+        cited=("bell1993", "willsky1976", "lowry1992"),
+    ),
+)
 
 
 class ElectrodeState(eqx.Module):
@@ -28,7 +84,7 @@ class ElectrodeState(eqx.Module):
         chi2: χ² of the last pulse.
         rrse: RRSE of the last pulse.
         result: Verdict on the last pulse.
-        mean: Moving mean of the innovations, d in `etid.online.changes`.
+        mean: Moving mean of the innovations, m in `etid.online.alarms`.
         mean_cov: Covariance of `mean`.
         event: Change found by the last pulse: 0 for none, 1 for a jump, 2 for a drift.
         factor: Logarithms of new over old elements at the last change.
@@ -91,3 +147,99 @@ class TrackerState(Overviewed, eqx.Module):
             ("electrode", "verdict", "pulses", "missed in a row", "chi2"),
             notes,
         )
+
+
+def fit_of(
+    model: GainModel, driver_result: RESULTS, driver_changed: Bool[Array, ""], state: ElectrodeState
+) -> Fit:
+    """The fit of one electrode."""
+    bands = model.bands
+    logs = LoadUnknowns.of(state.own).log_elements
+    elements = logs.size
+    expected = model.expected(logs)
+    nothing = jnp.zeros((elements, elements))
+    weight = bands.weight / state.variance
+    pulse = Pulse(model, jnp.zeros_like(expected.gain), weight, logs, nothing)
+    jacobian = pulse.jacobian(expected)
+    by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
+    # ∂G/∂ log Z_th = −G (1 − G)
+    by_source = as_complex(jnp.sqrt(weight)) * expected.gain * (1 - expected.gain)
+    of_source = by_term @ real_parts(by_source[None, :] * model.source_error).T
+    # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
+    of_x = jnp.tile(power(expected.gain) * bands.variance_x / state.variance, 2)
+    shared = of_source @ of_source.T + (by_term * of_x[None, :]) @ by_term.T
+    cov = inverse(state.information) + shared
+    relative = jnp.sqrt(jnp.diagonal(cov))
+    fitted = model.circuit.with_log_values(logs)
+    scale = jnp.outer(fitted.values(), fitted.values())
+    known_at_all = state.pulses > 0
+    return Fit(
+        circuit=fitted,
+        cov=jnp.where(known_at_all, cov * scale, jnp.nan),
+        shared_cov=jnp.where(known_at_all, shared * scale, jnp.nan),
+        rrse=state.rrse,
+        chi2=state.chi2,
+        result=first_verdict(
+            (state.result != SUCCESSFUL, state.result),
+            (~jnp.all(relative < 1), RESULTS.insensitive),
+            (driver_result != SUCCESSFUL, RESULTS.driver_failed),
+            (driver_changed, RESULTS.inconsistent),
+        ),
+        steps=state.pulses,
+        method=METHOD,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """A change that a pulse has shown.
+
+    Attributes:
+        pulse: Number of the pulse since the start, from 1 on.
+        electrode: Number of the electrode; None if the driver has changed.
+        kind: `jump`, `drift`, or `driver`.
+        element: Name of the element that explains the change best; empty for the driver.
+        factor: New value of this element divided by the old one; NaN for the driver.
+    """
+
+    pulse: int
+    electrode: int | None
+    kind: str
+    element: str
+    factor: float
+
+
+def changes(state: TrackerState, names: tuple[str, ...]) -> list[Change]:
+    """The changes that the last pulse has shown; see `Tracker.changes`."""
+    number, lanes = int(state.number), state.electrodes
+    if state.driver_event:
+        return [Change(number, None, "driver", "", math.nan)]
+    event, element, factor = map(np.asarray, (lanes.event, lanes.element, lanes.factor))
+    return [
+        Change(
+            number,
+            int(at),
+            KINDS[event[at]],
+            names[element[at]],
+            float(np.exp(factor[at, element[at]])),
+        )
+        for at in np.flatnonzero(event != NONE)
+    ]
+
+
+def bad_electrodes(state: TrackerState, impedance: Float[np.ndarray, " lane"]) -> dict[int, str]:
+    """Electrodes that cannot be used, with the reason; see `Tracker.bad_electrodes`."""
+    lanes = state.electrodes
+    known = np.asarray(lanes.pulses) > 0
+    since = int(state.number) - np.asarray(lanes.drifted)
+    reasons = {
+        "open": verdict_names(lanes.result) == "unconnected",
+        "shorted": np.asarray(lanes.level) < SHORTED,
+        "dry": known & (impedance > DRY),
+        "drifting": (np.asarray(lanes.drifted) >= 0) & (since < RECENT),
+    }
+    found: dict[int, str] = {}
+    for reason, applies in reasons.items():
+        for electrode in np.flatnonzero(applies):
+            found.setdefault(int(electrode), reason)
+    return dict(sorted(found.items()))

@@ -1,31 +1,108 @@
-"""One tick: the states of all electrodes after one more pulse, as one compiled program."""
+"""One tick: the states of all electrodes after one more pulse, as one compiled program.
+
+For each electrode a tick has the verdict on the samples, the fit with the prediction, the tests for
+a change, a fit of the pulse alone where it is new or suspected, and the state after it.
+"""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.estimators.judgement import SUCCESSFUL
+from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.estimators.starts import circuit_starts
 from etid.estimators.unknowns import LoadUnknowns
-from etid.online import changes
-from etid.online.changes import driver_change
-from etid.online.electrode import (
-    Measured,
-    after_pulse,
-    anew,
-    predicted,
-    suspicion,
-    tracked,
-)
+from etid.online.alarms import GainScore, Innovation, averaged, driver_change
 from etid.online.gain_bands import Bands
 from etid.online.projection import Seen
-from etid.online.pulse_fit import Expected, GainModel
-from etid.online.state import ElectrodeState, TrackerState
+from etid.online.pulse_fit import (
+    DELAYS,
+    SETTLED,
+    Expected,
+    GainModel,
+    Pulse,
+    minimum,
+    nearest_delay,
+    searched,
+)
+from etid.online.state import DRIFT, JUMP, NONE, OPEN, ElectrodeState, TrackerState
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.transfer import as_complex, power
+from etid.solvers.matrices import inverse_of_few
 
 STEADY = 0.1  # relative change of amplitude up to which the mean of a window is its offset
 FLAT = 4.0  # power relative to that of noise alone; below this, the pulse is `flat`
+NOISY = 5.2  # standard deviations of a pulse's χ² that noise exceeds once in 10⁷ pulses
+PATIENCE = 5  # pulses in a row that do not fit, after which an electrode starts again
+
+
+class Measured(NamedTuple):
+    """What a pulse shows at one electrode, or at all of them along a leading axis.
+
+    Attributes:
+        gain: Measured gain.
+        variance: E|noise|² of a Fourier coefficient of V_out [V²].
+        weight: Weight of |Ĝ − G|² in each band.
+        level: Effective value of the gain.
+        amplitude: Amplitude of the pulse, relative to that of the unloaded record.
+        offset: Offset of the converter [V].
+        steady: Whether the amplitude is nearly that of the pulse before.
+        shown: A number that two different windows never share.
+        bad: Verdict on the samples.
+    """
+
+    gain: Complex[Array, "*lane band"]
+    variance: Float[Array, "*lane"]
+    weight: Float[Array, "*lane band"]
+    level: Float[Array, "*lane"]
+    amplitude: Float[Array, "*lane"]
+    offset: Float[Array, "*lane"]
+    steady: Bool[Array, "*lane"]
+    shown: Float[Array, "*lane"]
+    bad: RESULTS
+
+
+class Attempt(NamedTuple):
+    """A fit of one pulse.
+
+    Attributes:
+        own: Logarithms of the elements [SI] and delay [samples].
+        information: Information of this pulse about the elements.
+        spread: Its inverse.
+        chi2: χ² of the pulse.
+        rrse: RRSE of the pulse.
+        result: Verdict.
+        gain: Score of the gain.
+    """
+
+    own: Float[Array, "*lane own"]
+    information: Float[Array, "*lane element element"]
+    spread: Float[Array, "*lane element element"]
+    chi2: Float[Array, "*lane"]
+    rrse: Float[Array, "*lane"]
+    result: RESULTS
+    gain: GainScore
+
+
+class Suspicion(NamedTuple):
+    """The tests of a pulse for a change.
+
+    Attributes:
+        jump: Whether the pulse does not fit its prediction.
+        drift: Whether the moving mean of the innovations is not zero.
+        mean: Moving mean of the innovations.
+        mean_cov: Its covariance.
+        element: The element that explains the drift best.
+        z: Components of innovation and moving mean along a change of Z_th [standard deviations].
+    """
+
+    jump: Bool[Array, "*lane"]
+    drift: Bool[Array, "*lane"]
+    mean: Float[Array, "*lane element"]
+    mean_cov: Float[Array, "*lane element element"]
+    element: Int[Array, "*lane"]
+    z: Float[Array, "*lane 2"]
 
 
 @jax.jit  # `program` and `equinox.filter_jit` would cost a tenth of a tick at every call
@@ -48,15 +125,13 @@ def updated(
         amplitude: Relative amplitude of the pulse.
     """
     before, number = state.electrodes, state.number + 1
+    powers = model.circuit.scaling()[0]  # also how a change of Z_th moves the elements
     measured = measured_pulse(model.bands, seen, amplitude, before)
     information = jax.vmap(lambda of: predicted(of, change))(before.information)
     logs = LoadUnknowns.of(before.own).log_elements
     expected = _expected(model, logs, number)
-    found = jax.vmap(lambda *of: tracked(model, *of))(before, measured, expected, information)
-    common = model.circuit.scaling()[0]
-    suspected = jax.vmap(lambda a, b, c: suspicion(a, b, c, common, limit))(
-        before, found, information
-    )
+    found = jax.vmap(lambda *of: _tracked(model, *of))(before, measured, expected, information)
+    suspected = jax.vmap(lambda *of: suspicion(*of, powers, limit))(before, found, information)
     running = before.pulses > 0
     wanted = (~running | suspected.jump | suspected.drift) & (measured.bad == SUCCESSFUL)
     starts = circuit_starts(model.circuit, None)
@@ -68,8 +143,7 @@ def updated(
         wanted,
         logs,
     )
-    powers = model.circuit.scaling()[0]
-    after = jax.vmap(lambda a, b, c, d, e, f: after_pulse(a, b, c, d, e, f, limit, number, powers))(
+    after = jax.vmap(lambda *of: after_pulse(*of, limit, number, powers))(
         before, measured, information, found, fresh, suspected
     )
     counts = running & measured.steady & (measured.bad == SUCCESSFUL)
@@ -98,14 +172,7 @@ def _expected(
 def measured_pulse(
     bands: Bands, seen: Seen, amplitude: Float[Array, " lane"], before: ElectrodeState
 ) -> Measured:
-    """Gains of a pulse, and the verdict on its samples.
-
-    Args:
-        bands: The unloaded pulse.
-        seen: The bands of the windows.
-        amplitude: Relative amplitude of the pulse.
-        before: State before the pulse.
-    """
+    """Gains of a pulse, and the verdict on its samples."""
     relative = jnp.where(amplitude > 0, amplitude, 1.0)
     known = jnp.isfinite(before.amplitude)
     lacking = jnp.where(known, (relative - before.amplitude) / relative, 0.0)
@@ -115,9 +182,10 @@ def measured_pulse(
     steady = jnp.abs(lacking) < STEADY
     offset = jnp.where(finite & steady, mean, before.offset)
     unknown = ~jnp.isfinite(offset)
-    gains = bands.measure(seen, lacking, jnp.where(unknown, 0.0, offset))
-    signal = power(gains.gain) @ bands.weight
-    noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * gains.variance
+    gain, weight = bands.measure(seen, lacking, jnp.where(unknown, 0.0, offset))
+    variance = jnp.asarray(seen.variance)
+    signal = power(gain) @ bands.weight
+    noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * variance
     flat = (signal < FLAT * noise) | ~(amplitude > 0)
     level = jnp.sqrt(jnp.maximum(signal - noise, 0.0) / jnp.sum(bands.weight)) / relative
     shown = power(seen.gain()) @ bands.weight  # of the samples alone
@@ -131,15 +199,199 @@ def measured_pulse(
             (repeated, RESULTS.repeated),
             (unconnected, RESULTS.unconnected),
         )
-    )(finite, seen.clipped, unknown, flat, repeated, jnp.abs(level - 1) < 1 - changes.OPEN)
+    )(finite, seen.clipped, unknown, flat, repeated, jnp.abs(level - 1) < 1 - OPEN)
     return Measured(
-        gain=gains.gain * as_complex(1 / relative)[:, None],
-        variance=gains.variance / relative**2,
-        weight=gains.weight * relative[:, None] ** 2,
+        gain=gain * as_complex(1 / relative)[:, None],
+        variance=variance / relative**2,
+        weight=weight * relative[:, None] ** 2,
         level=level,
         amplitude=amplitude,
         offset=offset,
         steady=steady,
         shown=shown,
         bad=bad,
+    )
+
+
+def predicted(
+    information: Float[Array, "element element"], change: Float[Array, ""]
+) -> Float[Array, "element element"]:
+    """Λ⁻ = (Λ⁻¹ + q² 1)⁻¹, which also holds for a singular Λ."""
+    elements = information.shape[0]
+    lost = inverse_of_few(jnp.eye(elements) + change**2 * information)
+    return information - change**2 * (information @ lost @ information)
+
+
+def attempt(
+    model: GainModel,
+    measured: Measured,
+    start: LoadUnknowns,
+    expected: Expected,
+    centre: Float[Array, " element"],
+    information: Float[Array, "element element"],
+) -> Attempt:
+    """The fit of a pulse from a start near its minimum."""
+    gain = measured.gain - model.departure(expected, start.delay_samples)
+    pulse = Pulse(model, gain, measured.weight, centre, information)
+    own, at, decrement, residual = minimum(pulse, start, expected)
+    weight = model.bands.weight
+    freedom = 2 * jnp.sum(weight > 0, dtype=at.squares.dtype) - own.size
+    chi2 = at.squares / freedom
+    # The cube root of χ² is nearly normal (Wilson and Hilferty 1931).
+    width = 2 / 9 * (1 / freedom + 1 / model.noise_freedom)
+    noisy = chi2 < (1 - width + NOISY * jnp.sqrt(width)) ** 3
+    rrse = jnp.sqrt(at.squares * measured.variance / jnp.sum(weight * power(gain)))
+    by_delay = at.curvature[:-1, -1]
+    told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
+    inverse = inverse_of_few(at.curvature)
+    score = GainScore.of(pulse, measured.variance, expected, residual, inverse)
+    late = jnp.abs(LoadUnknowns.of(own).delay_samples) > DELAYS[-1]
+    result = first_verdict(
+        (measured.bad != SUCCESSFUL, measured.bad),
+        (~jnp.isfinite(own).all(), RESULTS.nonphysical),
+        (~(decrement < SETTLED**2), MAX_STEPS_REACHED),
+        (misses(chi2, rrse) & ~noisy | late, RESULTS.misfit),
+    )
+    return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, score)
+
+
+def _tracked(
+    model: GainModel,
+    state: ElectrodeState,
+    measured: Measured,
+    expected: Expected,
+    information: Float[Array, "element element"],
+) -> Attempt:
+    """The fit of a pulse, with the prediction from the pulses before it."""
+    logs = LoadUnknowns.of(state.own).log_elements
+    delay, _ = nearest_delay(model, measured.gain, expected.gain)
+    return attempt(model, measured, LoadUnknowns(logs, delay), expected, logs, information)
+
+
+def anew(
+    model: GainModel,
+    measured: Measured,
+    starts: Float[Array, "start element"],
+    wanted: Bool[Array, ""],
+    logs: Float[Array, " element"],
+) -> Attempt:
+    """The fit of a pulse alone, from the nearest of several starts.
+
+    Args:
+        model: Model of the gain.
+        measured: The pulse.
+        starts: Logarithms of the elements.
+        wanted: Whether the result is used; otherwise the search ends at once.
+        logs: One more start: a search that has not settled continues with the next pulse.
+    """
+    logs = jnp.concatenate([starts, logs[None, :]])
+    gains = jax.vmap(model.undelayed)(logs)
+    delays, distances = jax.vmap(lambda one: nearest_delay(model, measured.gain, one))(gains)
+    # `argmin` would take a start without a number: a search that diverged would never end.
+    number = jnp.argmin(jnp.where(jnp.isfinite(distances), distances, jnp.inf))
+    start, delay = logs[number], delays[number]
+    nothing = jnp.zeros((starts.shape[1], starts.shape[1]))
+    gain = measured.gain - model.departure(model.expected(start), delay)
+    pulse = Pulse(model, gain, measured.weight, start, nothing)
+    own = LoadUnknowns.of(searched(pulse.equations_at, LoadUnknowns(start, delay).vector(), wanted))
+    expected = model.expected(own.log_elements)
+    found = attempt(model, measured, own, expected, own.log_elements, nothing)
+    unknown = ~jnp.all(jnp.diagonal(found.spread) < 1)
+    result = first_verdict(
+        (found.result != SUCCESSFUL, found.result), (unknown, RESULTS.insensitive)
+    )
+    return found._replace(result=result)
+
+
+def suspicion(
+    state: ElectrodeState,
+    found: Attempt,
+    information: Float[Array, "element element"],
+    common: Float[Array, " element"],
+    limit: Float[Array, ""],
+) -> Suspicion:
+    """Test one pulse of an electrode; see `etid.online.alarms`."""
+    before, after = LoadUnknowns.of(state.own), LoadUnknowns.of(found.own)
+    off = after.log_elements - before.log_elements
+    new = Innovation.of(off + found.spread @ information @ off, found.spread, information)
+    moving = averaged(state.mean, state.mean_cov, new)
+    running, fits = state.pulses > 0, found.result == SUCCESSFUL
+    return Suspicion(
+        running & ~(fits & (new.statistic() <= limit)),
+        running & fits & (moving.statistic() > limit),
+        moving.d,
+        moving.cov,
+        moving.element(),
+        jnp.stack([new.along(common), moving.along(common)]),
+    )
+
+
+def after_pulse(
+    state: ElectrodeState,
+    measured: Measured,
+    information: Float[Array, "element element"],
+    found: Attempt,
+    fresh: Attempt,
+    suspected: Suspicion,
+    limit: Float[Array, ""],
+    number: Int[Array, ""],
+    powers: Float[Array, " element"],
+) -> ElectrodeState:
+    """State of one electrode after one pulse."""
+    running = state.pulses > 0
+    again = ~running | suspected.jump | suspected.drift
+    used: Attempt = jax.tree.map(lambda new, old: jnp.where(again, new, old), fresh, found)
+    good = used.result == SUCCESSFUL
+    factor = LoadUnknowns.of(used.own).log_elements - LoadUnknowns.of(state.own).log_elements
+    moved = Innovation.of(factor, used.spread, information)
+    jumped = running & suspected.jump & good & (moved.statistic() > limit)
+    drifted = running & suspected.drift & good & ~jumped
+    event = jnp.where(jumped, JUMP, jnp.where(drifted, DRIFT, NONE)).astype(int)
+    changed = jumped | drifted
+
+    silent = measured.amplitude == 0
+    missed = jnp.where(good, 0, state.missed + jnp.where(silent, 0, 1))
+    lost = running & ((missed >= PATIENCE) | (measured.bad == RESULTS.unconnected))
+    restarted = good & again
+    one = jnp.where(restarted, 1, state.pulses + 1)
+    gain = used.gain.sums + jnp.where(restarted, 0.0, state.gain)
+    gain = jnp.where(good, gain, state.gain)
+    wrong_gain = good & used.gain._replace(sums=gain).wrong()
+    fits = running & good & ~suspected.jump & ~wrong_gain
+    reached = jnp.maximum(state.confirmed, measured.amplitude)
+    begun = ~running & (used.result == MAX_STEPS_REACHED)
+    # An impedance is nearly linear in resistances and in 1/C, less so in their logarithms: what is
+    # known of R in ohm stays, so that what is known of log R grows with R². Otherwise pulses weigh
+    # more where noise made R larger.
+    grown = jnp.exp(powers * factor)
+    summed = (information + used.information) * grown[:, None] * grown[None, :]
+    gained = jnp.where(restarted, used.information, summed)
+    followed = good & ~again
+    return ElectrodeState(
+        own=jnp.where(good | begun, used.own, state.own),
+        information=jnp.where(lost, 0.0, jnp.where(good, gained, information)),
+        pulses=jnp.where(lost, 0, jnp.where(good, one, state.pulses)),
+        missed=missed,
+        amplitude=measured.amplitude,
+        offset=measured.offset,
+        shown=jnp.stack([measured.shown, state.shown[0]]),
+        confirmed=jnp.where(fits, reached, jnp.where(silent, state.confirmed, 0.0)),
+        gain=gain,
+        level=jnp.where(silent, state.level, measured.level),
+        variance=jnp.where(silent, state.variance, measured.variance),
+        chi2=jnp.where(silent, state.chi2, used.chi2),
+        rrse=jnp.where(silent, state.rrse, used.rrse),
+        result=RESULTS.where(
+            silent, state.result, RESULTS.where(wrong_gain, RESULTS.misfit, used.result)
+        ),
+        mean=jnp.where(followed, suspected.mean, jnp.where(good | lost, 0.0, state.mean)),
+        mean_cov=jnp.where(
+            followed, suspected.mean_cov, jnp.where(good | lost, 0.0, state.mean_cov)
+        ),
+        event=event,
+        factor=jnp.where(changed, factor, state.factor),
+        element=jnp.where(
+            jumped, moved.element(), jnp.where(drifted, suspected.element, state.element)
+        ),
+        drifted=jnp.where(drifted, number, state.drifted),
     )

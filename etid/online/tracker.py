@@ -24,13 +24,13 @@ is the same sum.
 **A pulse takes two evaluations of the model**, the first with derivatives, from the best delay of
 a grid. An electrode that is
 new, or that does not fit its prediction, is fitted anew from generic start values, by up to 40
-more. `etid.online.changes` says when this is a change of the skin or of the driver.
+more. `etid.online.alarms` says when this is a change of the skin or of the driver.
 
 **A pulse that does not fit** even then changes only the verdict. The electrode starts again after
 several such pulses in a row, and at once if it touches nothing.
 
 **Amplitude.** V_out is divided by the amplitude of its pulse, relative to that of the unloaded
-record. The driver is linear. `etid.online.gain_test` says when the gain or the amplitude is wrong.
+record. The driver is linear. `etid.online.alarms` says when the gain or the amplitude is wrong.
 
 Z_th comes from the calibrations only; the pulses do not change it. More pulses reduce neither its
 error nor the error from the noise of the unloaded record: both are in `shared_cov`. Calibrate with
@@ -47,19 +47,23 @@ from jaxtyping import Array, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import circuit_of, number_of, require
 from etid.identify.one import known_at
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
-from etid.online import changes
-from etid.online.changes import Change
+from etid.online.alarms import limit
 from etid.online.gain_bands import cut, unloaded_bands
 from etid.online.projection import Projection
 from etid.online.pulse_fit import GainModel
-from etid.online.reading import fit_of
-from etid.online.state import ElectrodeState, TrackerState
+from etid.online.state import (
+    Change,
+    ElectrodeState,
+    TrackerState,
+    bad_electrodes,
+    changes,
+    fit_of,
+)
 from etid.online.tick import updated
 from etid.precision import in_float64
 from etid.recordings.errors import not_recorded
@@ -90,7 +94,6 @@ class Tracker(Overviewed):
     Attributes:
         model: Model of the gain of a pulse.
         projection: What makes bands of the samples of a pulse.
-        known: Z_th in the bands and its covariance, from the calibrations.
         change: Standard deviation of the random walk of the elements' logarithms [1/√pulse].
         limit: Limit of the tests for a change [χ²].
         adc_range: Voltages at which the converter saturates [V].
@@ -101,7 +104,6 @@ class Tracker(Overviewed):
 
     model: GainModel
     projection: Projection
-    known: GivenDriver
     change: Float[Array, ""]
     limit: Float[Array, ""]
     adc_range: Float[np.ndarray, " 2"]
@@ -183,9 +185,8 @@ class Tracker(Overviewed):
         return cls(
             model=model,
             projection=projection,
-            known=known,
             change=jnp.asarray(float(change)),
-            limit=jnp.asarray(changes.limit(len(model.circuit.names()), rate / period)),
+            limit=jnp.asarray(limit(len(model.circuit.names()), rate / period)),
             adc_range=np.array([low + half, high - half]),
             driver_result=driver.result,
             electrodes=electrodes,
@@ -339,7 +340,7 @@ class Tracker(Overviewed):
             RecordingError: `state` is no state of a tracker.
         """
         self.check(state)
-        found = _judged(self.model, self.known, self.driver_result, state)
+        found = _judged(self.model, self.driver_result, state)
         fit = jax.tree.map(np.asarray, found)
         electrodes = [
             {"path": f"electrode/{number}", "electrode": str(number)}
@@ -350,7 +351,7 @@ class Tracker(Overviewed):
 
     @in_float64
     def changes(self, state: TrackerState) -> list[Change]:
-        """The changes that the last pulse has shown; see `etid.online.changes`.
+        """The changes that the last pulse has shown; see `etid.online.alarms`.
 
         Expect one false alarm per electrode in 20 hours, and none of the driver. If the driver has
         changed, the changes of the electrodes are not listed, and all verdicts remain
@@ -359,7 +360,7 @@ class Tracker(Overviewed):
         Args:
             state: State of the tracker.
         """
-        return changes.changes(state, self.model.circuit.names())
+        return changes(state, self.model.circuit.names())
 
     @in_float64
     def bad_electrodes(self, state: TrackerState) -> dict[int, str]:
@@ -374,13 +375,11 @@ class Tracker(Overviewed):
         logs = state.electrodes.own[:, :-1]
         lowest = self.model.bands.frequency[:1]
         z = jax.vmap(lambda one: self.model.circuit.with_log_values(one).response(lowest)[0])(logs)
-        return changes.bad_electrodes(state, np.abs(np.asarray(z)))
+        return bad_electrodes(state, np.abs(np.asarray(z)))
 
 
 @program
-def _judged(
-    model: GainModel, known: GivenDriver, driver_result: RESULTS, state: TrackerState
-) -> Fit:
-    return jax.vmap(lambda of: fit_of(model, known, driver_result, state.driver_changed, of))(
+def _judged(model: GainModel, driver_result: RESULTS, state: TrackerState) -> Fit:
+    return jax.vmap(lambda of: fit_of(model, driver_result, state.driver_changed, of))(
         state.electrodes
     )

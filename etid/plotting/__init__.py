@@ -144,7 +144,7 @@ def _draw(
 ) -> np.ndarray:
     import matplotlib as mpl
 
-    from etid.plotting import candidates, elements, impedances, judging, posteriors, pulses, style
+    from etid.plotting import elements, impedances, judging, pulses, style
 
     if show not in get_args(Shown) or (show != "pulse" and not isinstance(x, Fit)):
         raise ValueError(
@@ -165,7 +165,7 @@ def _draw(
                 }[show]
                 return draw(canvas, x, recording, driver)
             case Selection(), Recording(), _ if driver is not None or with_current:
-                return candidates.draw_selection(canvas, x, recording, driver)
+                return judging.draw_selection(canvas, x, recording, driver)
             case Driver(), Recording(), None:
                 return pulses.draw_calibration(canvas, x, recording)
             case Fit(measured=MeasuredImpedance() as measured), None, _:
@@ -185,9 +185,9 @@ def _draw(
             case Fits(), None, None:
                 return elements.draw_fits(canvas, x)
             case Posterior(), None, None:
-                return posteriors.draw_posterior(canvas, x)
+                return elements.draw_posterior(canvas, x)
             case Profile(), None, None:
-                return posteriors.draw_profile(canvas, x)
+                return elements.draw_profile(canvas, x)
             case Bound(), None, None:
                 return elements.draw_bounds(canvas, [x])
             case ((Driver() | SourceImpedance()), None, None):

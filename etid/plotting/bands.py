@@ -18,6 +18,7 @@ import dataclasses
 
 import jax
 import numpy as np
+import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
@@ -58,9 +59,7 @@ def bands(
         feed: Driver with its covariance, or the measured current.
         circuit: Fitted circuit.
     """
-    terms = _Terms.of(lane, feed, circuit)
-    p = terms.fitted()
-    gain, turned, z_th = terms.at(p)
+    gain, turned, z_th = _fitted(lane, feed, circuit)
     var = lane.variance_y + np.abs(turned) ** 2 * lane.variance_x
     x = (lane.variance_y * lane.x + lane.variance_x * np.conj(turned) * lane.y) / var
     by_load = np.ones_like(gain) if z_th is None else 1 - gain  # ∂ ln G/∂ ln Z
@@ -110,78 +109,38 @@ def _source(
     return z_th(values), jax.jacfwd(z_th)(values).T
 
 
-@dataclasses.dataclass(frozen=True)
-class _Terms:
-    """The terms of a recording as a function of its delay and of the Z_th of its driver.
+def _fitted(
+    lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
+) -> tuple[
+    Complex[np.ndarray, " harmonic"],
+    Complex[np.ndarray, " harmonic"],
+    Complex[np.ndarray, " harmonic"] | None,
+]:
+    """G, G e^(−jωτ) and Z_th at the delay τ and the changes of Z_th that fit the recording.
 
-    The parameters are the delay [samples] and changes of Z_th in standard deviations.
-
-    Attributes:
-        lane: Harmonics of the recording.
-        z: Impedance of the load [Ω].
-        z_th: Source impedance [Ω]; None for a measured current.
-        slopes: Derivatives of Z_th with respect to its changes [Ω].
+    Z_th is None for a measured current. Its changes are in standard deviations.
     """
+    frequency = jax.device_put(lane.frequency)
+    z = np.asarray(circuit.response(frequency))
+    turn = np.asarray(2 * np.pi * lane.frequency / lane.sample_rate)
+    source, changes = None, np.zeros((0, z.size), complex)
+    if not isinstance(feed, MeasuredCurrent):
+        source, slopes = map(np.asarray, _source(feed.source, frequency))
+        size, vectors = np.linalg.eigh(np.asarray(feed.later_cov()))
+        changes = (vectors * np.sqrt(np.maximum(size, 0.0))).T @ slopes
+    deviations = np.append(DELAY_WIDTH, np.ones(len(changes)))
 
-    lane: Harmonics
-    z: Complex[np.ndarray, " harmonic"]
-    z_th: Complex[np.ndarray, " harmonic"] | None
-    slopes: Complex[np.ndarray, "change harmonic"]
+    def at(p: Float[np.ndarray, " parameter"]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        z_th = None if source is None else source + p[1:] @ changes
+        gain = z if z_th is None else z / (z + z_th)
+        return gain, gain * np.exp(-1j * p[0] * turn), z_th
 
-    @classmethod
-    def of(
-        cls, lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
-    ) -> "_Terms":
-        frequency = jax.device_put(lane.frequency)
-        z = np.asarray(circuit.response(frequency))
-        if isinstance(feed, MeasuredCurrent):
-            return cls(lane, z, None, np.zeros((0, z.size), complex))
-        z_th, slopes = map(np.asarray, _source(feed.source, frequency))
-        size, turn = np.linalg.eigh(np.asarray(feed.later_cov()))
-        root = turn * np.sqrt(np.maximum(size, 0.0))
-        return cls(lane, z, z_th, root.T @ slopes)
+    start = np.zeros(deviations.size)
+    variance = lane.variance_y + np.abs(at(start)[0]) ** 2 * lane.variance_x
+    scale = np.where(lane.selected, np.sqrt(2 / variance), 0.0)
 
-    def at(
-        self, p: Float[np.ndarray, " parameter"]
-    ) -> tuple[
-        Complex[np.ndarray, " harmonic"],
-        Complex[np.ndarray, " harmonic"],
-        Complex[np.ndarray, " harmonic"] | None,
-    ]:
-        """G, G e^(−jωτ) and Z_th."""
-        z_th = None if self.z_th is None else self.z_th + p[1:] @ self.slopes
-        gain = self.z if z_th is None else self.z / (self.z + z_th)
-        return gain, gain * np.exp(-1j * p[0] * self._turn), z_th
+    def terms(p: Float[np.ndarray, " parameter"]) -> Float[np.ndarray, " term"]:
+        rest = (lane.y - at(p)[1] * lane.x) * scale
+        return np.concatenate([np.real(rest), np.imag(rest), p / deviations])
 
-    @property
-    def _turn(self) -> Float[np.ndarray, " harmonic"]:
-        return np.asarray(2 * np.pi * self.lane.frequency / self.lane.sample_rate)
-
-    def _residual(
-        self, p: Float[np.ndarray, " parameter"]
-    ) -> tuple[Float[np.ndarray, " term"], Float[np.ndarray, "parameter term"]]:
-        """Terms with the priors, and their derivatives without those of the variance."""
-        lane = self.lane
-        _, turned, z_th = self.at(p)
-        var = lane.variance_y + np.abs(turned) ** 2 * lane.variance_x
-        scale = np.where(lane.selected, np.sqrt(2 / var), 0.0)
-        by_z_th = self.slopes if z_th is None else -self.slopes / (self.z + z_th)
-        by = np.concatenate([-1j * self._turn[None], by_z_th]) * (turned * lane.x * -scale)
-        rest = (lane.y - turned * lane.x) * scale
-        prior = np.diag(np.append(1 / DELAY_WIDTH, np.ones(p.size - 1)))
-        terms = np.concatenate([np.real(rest), np.imag(rest), prior @ p])
-        return terms, np.concatenate([np.real(by), np.imag(by), prior], axis=1)
-
-    def fitted(self) -> Float[np.ndarray, " parameter"]:
-        """The parameters that fit the recording."""
-
-        def cost(p: Float[np.ndarray, " parameter"]) -> float:
-            return float(np.sum(self._residual(p)[0] ** 2))
-
-        p = np.zeros(len(self.slopes) + 1)
-        for _ in range(6):  # the terms are almost linear
-            terms, slopes = self._residual(p)
-            step = -np.linalg.lstsq(slopes.T, terms)[0]
-            # Parts of a step, for circuits that are far from the data.
-            p = min((p + part * step for part in (1.0, 0.3, 0.1, 0.03, 0.0)), key=cost)
-        return p
+    return at(scipy.optimize.least_squares(terms, start, method="lm").x)

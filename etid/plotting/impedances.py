@@ -1,6 +1,7 @@
 """Pictures of impedances over frequency, with bands of two standard errors."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,29 +35,58 @@ def draw_bode(
             if thing.verdict != "successful":
                 failed.append(f"{label}: no success: {thing.verdict}")
             label = label if known else f"{label}, no standard error"
-        colour = COLOURS[i % len(COLOURS)]
-        look = {"color": colour, "linestyle": DASHES[i % len(DASHES)], "lw": 1.3}
+        colour, dash = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]
+        curve(magnitude, phase, frequency, z, label=label, color=colour, linestyle=dash, lw=1.3)
         sizes.append(np.abs(z) / 1e3)
-        angle = np.unwrap(np.angle(z))
-        magnitude.plot(kilohertz, sizes[-1], label=label, **look)
-        phase.plot(kilohertz, np.degrees(angle), label=label, **look)
         if known:
             banded = True
             band = {"color": colour, "alpha": 0.25, "linewidth": 0}
             factor = np.exp(np.minimum(2 * errors[0], 50))  # it is finite beyond every axis
             magnitude.fill_between(kilohertz, sizes[-1] / factor, sizes[-1] * factor, **band)
-            turn = 2 * errors[1]
+            angle, turn = np.unwrap(np.angle(z)), 2 * errors[1]
             phase.fill_between(kilohertz, *np.degrees([angle - turn, angle + turn]), **band)
-    magnitude.set(ylabel="|Z| [kΩ]", xscale="log", yscale="log")
-    phase.set(xlabel="frequency [kHz]", ylabel="phase [deg]", xscale="log")
+    phase.set(xlabel="frequency [kHz]")
     frame(magnitude, phase, np.concatenate(sizes))
     magnitude.legend(frameon=False, fontsize=8)
     titled(magnitude, failed or ["bands: two standard errors" if banded else ""], good=not failed)
     return axes
 
 
+def curve(
+    magnitude: Axes,
+    phase: Axes,
+    frequency: Float[Array | np.ndarray, " frequency"],
+    z: Complex[np.ndarray, " frequency"],
+    **look: Any,
+) -> None:
+    """Draw an impedance [Ω] over frequency [Hz], in kΩ and degrees over kHz."""
+    kilohertz = np.asarray(frequency) / 1e3
+    magnitude.plot(kilohertz, np.abs(z) / 1e3, **look)
+    phase.plot(kilohertz, np.degrees(np.unwrap(np.angle(z))), **look)
+
+
+def points(
+    magnitude: Axes,
+    phase: Axes,
+    frequency: Float[np.ndarray, " point"],
+    z: Complex[np.ndarray, " point"],
+    stderr: Float[np.ndarray, " point"] | None,
+    **look: Any,
+) -> None:
+    """Draw measured impedances [Ω], with two standard errors of ln Z if they are known."""
+    kilohertz, size, degrees = frequency / 1e3, np.abs(z) / 1e3, np.degrees(np.angle(z))
+    ends = turn = None
+    if stderr is not None:
+        ends = size * (1 - np.exp(-2 * stderr)), size * (np.exp(2 * stderr) - 1)
+        turn = np.degrees(2 * stderr)
+    magnitude.errorbar(kilohertz, size, ends, fmt="o", **look)
+    phase.errorbar(kilohertz, degrees, turn, fmt="o", **look)
+
+
 def frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> None:
-    """Set limits that show the curves even if the bands are wide, and ticks at 1, 2 and 5."""
+    """Label the axes, with limits that show the curves even if the bands are wide."""
+    magnitude.set(ylabel="|Z| [kΩ]", xscale="log", yscale="log")
+    phase.set(ylabel="phase [deg]", xscale="log")
     sizes = sizes[np.isfinite(sizes)]
     if sizes.size:
         magnitude.set_ylim(sizes.min() / 1.5, sizes.max() * 1.5)

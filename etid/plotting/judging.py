@@ -1,32 +1,37 @@
-"""Pictures that judge a fit: its impedance beside the measured one, and its residual."""
+"""Pictures that judge fits: impedances beside the measured one, residuals, rival circuits."""
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
-from etid.plotting.bands import CLEAR, bands
-from etid.plotting.impedances import POINTS, frame
+from etid.plotting.bands import CLEAR, Bands, bands
+from etid.plotting.impedances import POINTS, curve, frame, points
 from etid.plotting.pulses import headline
-from etid.plotting.style import BLUE, INK, RED, Canvas, titled
+from etid.plotting.style import BLUE, COLOURS, DASHES, INK, MARKS, RED, Canvas, titled
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
+from etid.recordings.remarks import Remark
 from etid.results.data import MeasuredImpedance
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
+from etid.selection.selection import Candidate, Selection
 
 
 def draw_impedance(
     canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None
 ) -> np.ndarray:
     """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
-    recording, known = in_bands(recording, driver)
+    recording, known = _in_bands(recording, driver)
     measured = bands(Harmonics.of(Inspected(recording)), known, fit.circuit)
     clear = measured.stderr <= CLEAR
     points = measured.frequency[clear], measured.z[clear], measured.stderr[clear]
@@ -49,27 +54,21 @@ def _diagrams(
 ) -> np.ndarray:
     """Nyquist and Bode diagrams of measured points, with standard errors of ln Z, and of a fit."""
     nyquist, magnitude, phase = axes = canvas(1, 3, (12.0, 3.8)).ravel()
-    kilohertz, kiloohm = frequency / 1e3, z / 1e3
-    smooth = np.geomspace(kilohertz.min() / 1.3, kilohertz.max() * 1.3, POINTS)
-    fitted = np.asarray(fit.circuit.response(jnp.asarray(1e3 * smooth))) / 1e3
-    curve = {"color": RED, "lw": 1.3, "label": "fit"}
+    smooth = np.geomspace(frequency.min() / 1.3, frequency.max() * 1.3, POINTS)
+    fitted = np.asarray(fit.circuit.response(jnp.asarray(smooth)))
+    line: Any = {"color": RED, "lw": 1.3, "label": "fit"}
     label = "measured" if stderr is None else "measured, ± 2 standard errors"
-    point = {"fmt": "o", "ms": 4, "lw": 0.8, "color": BLUE, "label": label}
-    turn = None if stderr is None else 2 * stderr
-    size = None if turn is None else turn * np.abs(kiloohm)
-    nyquist.plot(np.real(fitted), -np.imag(fitted), **curve)
-    nyquist.errorbar(np.real(kiloohm), -np.imag(kiloohm), yerr=size, xerr=size, **point)
+    point: Any = {"ms": 4, "lw": 0.8, "color": BLUE, "label": label}
+    size = None if stderr is None else 2 * stderr * np.abs(z) / 1e3
+    nyquist.plot(np.real(fitted) / 1e3, -np.imag(fitted) / 1e3, **line)
+    nyquist.errorbar(np.real(z) / 1e3, -np.imag(z) / 1e3, size, size, fmt="o", **point)
     nyquist.set(xlabel="Re Z [kΩ]", ylabel="-Im Z [kΩ]")
     nyquist.set_aspect("equal", adjustable="datalim")
-    magnitude.plot(smooth, np.abs(fitted), **curve)
-    magnitude.errorbar(kilohertz, np.abs(kiloohm), size, **point)
-    magnitude.set(xlabel="frequency [kHz]", ylabel="|Z| [kΩ]", xscale="log", yscale="log")
-    phase.plot(smooth, np.degrees(np.angle(fitted)), **curve)
-    phase.errorbar(
-        kilohertz, np.degrees(np.angle(z)), None if turn is None else np.degrees(turn), **point
-    )
-    phase.set(xlabel="frequency [kHz]", ylabel="phase [deg]", xscale="log")
-    frame(magnitude, phase, np.abs(kiloohm))
+    curve(magnitude, phase, smooth, fitted, **line)
+    points(magnitude, phase, frequency, z, stderr, **point)
+    frame(magnitude, phase, np.abs(z) / 1e3)
+    for axis in (magnitude, phase):
+        axis.set(xlabel="frequency [kHz]")
     magnitude.xaxis.set_major_formatter("{x:g}")
     magnitude.legend(frameon=False, fontsize=8)
     good = fit.verdict == "successful"
@@ -78,7 +77,7 @@ def _diagrams(
     return axes
 
 
-def in_bands(
+def _in_bands(
     recording: Recording, driver: Driver | None
 ) -> tuple[Recording, ContinuousDriver | MeasuredCurrent]:
     """A recording and its feed, for the impedance that it measures.
@@ -134,3 +133,92 @@ def _correlation(
     axis.axhspan(-band, band, color="0.85", lw=0)
     axis.vlines(lags, 0.0, np.array(products) / norm, color=INK, lw=0.9)
     axis.set(xlabel="lag [samples]", ylabel=label)
+
+
+def draw_selection(
+    canvas: Canvas, selection: Selection, recording: Recording, driver: Driver | None
+) -> np.ndarray:
+    """Magnitude and phase with all candidates, and below them the deviation of each candidate."""
+    ratios = {"height_ratios": [3, 1.6]}
+    axes = canvas(2, 2, (9.0, 5.2), sharex=True, gridspec_kw=ratios).ravel()
+    chosen = selection.candidates[0]
+    good = chosen.fit.verdict == "successful"
+    lines = [
+        headline(recording.path, selection.fit),
+        chosen.name,
+        ",  ".join(selection.fit.elements),
+    ]
+    fitted = [one for one in selection.candidates if _has_elements(one)]
+    if not fitted or fitted[0] is not chosen:
+        axes[0].text(0.5, 0.5, "no elements", color=RED, transform=axes[0].transAxes, ha="center")
+        titled(axes[0], lines[:1], good=False)
+        return axes
+    recording, known = _in_bands(recording, driver)
+    lane = Harmonics.of(Inspected(recording))
+    lane = lane.realigned(lane.late_by(chosen.fit.circuit, known))
+    if int(chosen.fit.remarks) & Remark.mains_hum:
+        lane = lane.without_mains() or lane
+    found = [bands(lane, known, one.fit.circuit) for one in fitted]
+    _measured_and_fitted(axes[0], axes[1], fitted, found[0])
+    _deviations(axes[2], axes[3], found)
+    titled(axes[0], lines, good=good)
+    return axes
+
+
+def _has_elements(candidate: Candidate) -> bool:
+    return bool(np.isfinite(np.asarray(candidate.fit.circuit.values())).all())
+
+
+def _look(number: int) -> dict[str, Any]:
+    """Look of a candidate; the first one is the chosen one."""
+    colour, dash = COLOURS[number % len(COLOURS)], DASHES[number % len(DASHES)]
+    # The bold line lies below the others, which it would hide.
+    width, layer = (1.1, 2.5) if number else (2.2, 2.2)
+    return {"color": colour, "linestyle": dash, "lw": width, "zorder": layer}
+
+
+def _measured_and_fitted(
+    magnitude: Axes, phase: Axes, fitted: list[Candidate], measured: Bands
+) -> None:
+    """The measured impedance, pale where it is uncertain, and those of the candidates."""
+    clear = measured.stderr <= CLEAR
+    for some, alpha in ((clear, 1.0), (~clear & (measured.stderr <= 1.0), 0.3)):
+        look: Any = {"color": INK, "ms": 3.5, "lw": 0.9, "capsize": 2.0, "alpha": alpha}
+        label = "measured" if alpha == 1.0 else None
+        of = measured.frequency[some], measured.z[some], measured.stderr[some]
+        points(magnitude, phase, *of, label=label, **look)
+    frequency = jnp.geomspace(measured.frequency[0], measured.frequency[-1], POINTS)
+    sizes = [np.abs(measured.z[clear]) / 1e3]
+    for number, one in enumerate(fitted):
+        z = np.asarray(one.fit.circuit.response(frequency))
+        sizes.append(np.abs(z) / 1e3)
+        curve(magnitude, phase, frequency, z, label=_label(number, one), **_look(number))
+    frame(magnitude, phase, np.concatenate(sizes))
+    magnitude.legend(frameon=False, fontsize=8, loc="lower left")
+
+
+def _label(number: int, one: Candidate) -> str:
+    if number == 0:
+        return f"{one.name}, chosen"
+    verdict = "" if one.fit.verdict == "successful" else f", {one.fit.verdict}"
+    return f"{one.name}, 2 log evidence {one.evidence:+.0f}{verdict}"
+
+
+def _deviations(magnitude: Axes, phase: Axes, found: list[Bands]) -> None:
+    """Measured minus fitted, in standard errors: up to 4 to scale, beyond by logarithm."""
+    plain = 4.0
+    largest = max(plain, *(np.abs(of.deviation).max() for of in found))
+    for part, (axis, name) in enumerate(((magnitude, "ln |Z|"), (phase, "phase"))):
+        axis.axhspan(-2.0, 2.0, color="0.85", lw=0)
+        axis.axhline(0.0, color="0.6", lw=0.6)
+        for number, of in enumerate(found):
+            mark = {"marker": MARKS[number % len(MARKS)], "ms": 3.0}
+            axis.plot(of.frequency / 1e3, of.deviation[part], **_look(number), **mark)
+        axis.set(xlabel="frequency [kHz]", ylabel=f"measured - fitted\n{name} [stderr]")
+        axis.set_yscale("symlog", linthresh=plain, linscale=1.0)
+        ticks = [tick for tick in (2.0, 10.0, 100.0, 1000.0, 10000.0) if tick <= largest]
+        axis.yaxis.set_major_locator(FixedLocator([*(-t for t in ticks), 0.0, *ticks]))
+        axis.yaxis.set_minor_locator(NullLocator())
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.set_ylim(-1.4 * largest, 1.4 * largest)
+        axis.xaxis.set_major_formatter("{x:g}")

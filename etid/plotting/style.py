@@ -101,10 +101,15 @@ def drawable(values: np.ndarray) -> np.ndarray:
 
 
 def plain_ticks(axis: Axis) -> None:
-    """Numbers at 1, 2 and 5 of each decade of a logarithmic axis."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(NullFormatter())
+    """Plain numbers on a logarithmic axis with limits: 10, 20, 50 if it is short, else 0.1, 1, 10.
+
+    An axis of more than six decades keeps its powers of ten.
+    """
+    low, high = sorted(axis.get_view_interval())
+    if 0 < low and high < 1e6 * low:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
 
 
 def symbol(name: str, unit: str) -> str:

@@ -20,7 +20,15 @@ from matplotlib.figure import Figure
 
 from etid.circuits.display import DISPLAY
 from etid.plotting import figure_of
-from etid.plotting.style import COLOURS, DASHES, MARKS, drawable, new_figure, symbol
+from etid.plotting.style import (
+    COLOURS,
+    DASHES,
+    MARKS,
+    drawable,
+    new_figure,
+    plain_ticks,
+    symbol,
+)
 from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
@@ -78,27 +86,13 @@ def distributions(fits: Fits) -> bytes:
         low, high = axis.dataLim.intervalx
         if 0 < NARROW * low < high:
             axis.set_xscale("log")
-            _plain(axis, "x")
+            plain_ticks(axis.xaxis)
         else:
             axis.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(5))
     axes[0, 0].set_ylabel("fits below [%]")
     if axes[0, 0].lines:
         axes[0, 0].legend(frameon=False, fontsize=8)
     return svg(figure)
-
-
-def _plain(axis: Axes, which: str) -> None:
-    """Label a logarithmic axis with plain numbers: 10, 20, 50 if it is short, else 0.1, 1, 10.
-
-    An axis of more than six decades keeps its powers of ten.
-    """
-    ticks = axis.xaxis if which == "x" else axis.yaxis
-    low, high = sorted(ticks.get_view_interval())
-    if 0 < low and high < 1e6 * low:
-        subs = (1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)
-        ticks.set_major_locator(matplotlib.ticker.LogLocator(subs=subs))
-        ticks.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-        ticks.set_minor_formatter(matplotlib.ticker.NullFormatter())
 
 
 def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) -> bytes:
@@ -119,7 +113,7 @@ def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) 
             axis.hist(known, bins=bins, color=COLOURS[0], edgecolor="white", lw=0.3)
             if wide:
                 axis.set_xscale("log")
-                _plain(axis, "x")
+                plain_ticks(axis.xaxis)
     return svg(figure)
 
 
@@ -153,7 +147,7 @@ def by_subject(fits: Fits) -> bytes:
                 markerfacecolor="white", label=_short(condition) or "all",
             )  # fmt: skip
         axis.set(yscale="log", ylabel=symbol(name, unit))
-        _plain(axis, "y")
+        plain_ticks(axis.yaxis)
     last = axes[-1, 0]
     if named:
         names = [_short(subject) or "-" for subject in subjects]
@@ -214,7 +208,7 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
         low, high = axis.dataLim.intervalx
         if 0 < low <= high < np.inf:
             axis.set_xlim(low / NARROW, high * NARROW)
-        _plain(axis, "x")
+        plain_ticks(axis.xaxis)
     axes[0, 0].set_yticks(range(len(parts)), parts)
     axes[0, 0].set_ylim(len(parts) - 0.5, -0.5)
     axes[0, 0].legend(frameon=False, fontsize=8)

@@ -15,6 +15,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 
 import jinja2
+import markupsafe
 import numpy as np
 
 from etid.recordings.replacing import replace_text
@@ -106,6 +107,8 @@ class Section:
         warning: A paragraph above the others that the reader must not overlook.
         tables: Tables below the paragraphs.
         pictures: Pictures below the tables; above them if a table is long.
+        details: Paragraphs that the page shows when the reader asks for them, with the tables and
+            the code of the section.
         code: Text at the end, to be copied unchanged.
     """
 
@@ -114,10 +117,11 @@ class Section:
     tables: tuple[Table, ...] = ()
     pictures: tuple[Picture, ...] = ()
     warning: str = ""
+    details: str = ""
     code: str = ""
 
     def __str__(self) -> str:
-        paragraphs = filter(None, [self.warning, *self.paragraphs])
+        paragraphs = filter(None, [self.warning, *_paragraphs(self.text + "\n\n" + self.details)])
         text = "\n\n".join(textwrap.fill(paragraph, 100) for paragraph in paragraphs)
         parts = [self.heading, "=" * len(self.heading), text, *map(str, self.tables), self.code]
         return "\n".join(filter(None, parts))
@@ -127,10 +131,14 @@ class Section:
         """Name of the section in a link."""
         return re.sub(r"[^a-z0-9]+", "-", self.heading.lower()).strip("-")
 
-    @property
-    def paragraphs(self) -> list[str]:
-        """The paragraphs of the text."""
-        return [paragraph for paragraph in self.text.split("\n\n") if paragraph]
+
+def _paragraphs(text: str) -> list[str]:
+    return [paragraph for paragraph in text.split("\n\n") if paragraph]
+
+
+def _marked(text: str) -> markupsafe.Markup:
+    """Escaped text, with what stands between backticks as code."""
+    return markupsafe.Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(markupsafe.escape(text))))
 
 
 def write_page(
@@ -151,6 +159,7 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    pages.filters |= {"marked": _marked, "paragraphs": _paragraphs}
     searchable = any(table.searchable for section in sections for table in section.tables)
     script = importlib.resources.files("etid.report").joinpath("templates/table.js")
     text_of_script = script.read_text("utf-8") if searchable else ""

@@ -11,18 +11,16 @@ import pathlib
 import re
 from collections.abc import Iterable, Sequence
 
-import numpy as np
-
 import etid.identify.amplitudes
 import etid.identify.jointly
-import etid.online.reading  # noqa: F401 - these modules describe their methods
-from etid.circuits.display import quantity
+import etid.online.state  # noqa: F401 - these modules describe their methods
+from etid.circuits.display import quantity, several
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, described
 from etid.report.html import Section, Table
 from etid.results.driver import ContinuousDriver
-from etid.results.fits import AND, joined
+from etid.results.fits import AND, Fits, joined
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.selection.common import LIMIT
@@ -43,7 +41,7 @@ def methods_section(found: StudyFits) -> Section:
     settings = found.settings
     if settings is not None and (settings.order == 0 or settings.candidates):
         cited.add("schwarz1978")
-    paragraphs = [
+    details = [
         _model(found),
         _driver(found),
         _estimator(found, known),
@@ -63,9 +61,10 @@ def methods_section(found: StudyFits) -> Section:
         )
     return Section(
         "Methods",
-        "\n\n".join(filter(None, paragraphs)),
+        _brief(found, known),
         () if settings is None else (_table(found, settings),),
         warning=" ".join(warnings),
+        details="\n\n".join(filter(None, details)),
         code=bibtex(cited),
     )
 
@@ -74,6 +73,46 @@ def words(method: str) -> str:
     """The estimators of one or several fits, as words for a sentence."""
     found = {name: described(name) for name in method.split(AND)}
     return " and ".join(name if one is None else one.words for name, one in found.items())
+
+
+def succeeded(fits: Fits) -> str:
+    """A sentence on the number of successful fits."""
+    good = fits.counts().get("successful", 0)
+    are = "is" if good == 1 else "are"
+    share = f"{several(good, 'fit')} ({100 * good / len(fits):.1f} %)"
+    return f"{share} {are} successful; only these enter medians and spreads."
+
+
+def _brief(found: StudyFits, known: Sequence[Description]) -> str:
+    """The methods in at most 120 words."""
+    circuit, errors = found.fits.circuit, "the noise of its recording"
+    load = f"{type(circuit).__name__}{f' (Z_L = {circuit.formula})' if circuit.formula else ''}"
+    text = (
+        f"The load of each recording was identified as the circuit {load} by "
+        f"{words(found.fits.fit.method)} (etid {importlib.metadata.version('etid')})"
+    )
+    if found.by_current:
+        text += ", from the measured current through it. "
+    else:
+        orders = " or ".join(map(str, sorted({driver.order for driver in found.drivers.values()})))
+        order = f", a rational function of order {orders}" if orders else ""
+        text += f", behind the source impedance Z_th of the driver{order}, from calibrations"
+        text += f" with known resistors{_resistors(found)}. "
+        errors += " and the error of the driver, which all recordings with that driver share"
+    if any(one.errors for one in known):
+        text += f"The standard error of a fit contains {errors}. "
+    text += (
+        "A fit counts as successful if it converged to plausible elements that its recording "
+        "determines, and leaves a residual that noise explains. "
+    )
+    return text + succeeded(found.fits)
+
+
+def _resistors(found: StudyFits) -> str:
+    """The known resistors of continuous drivers, such as ` of 21.62, 98.8 kΩ`."""
+    drivers = [one for one in found.drivers.values() if isinstance(one, ContinuousDriver)]
+    known = sorted({r for driver in drivers for r in driver.calibration.r_load.tolist()})
+    return f" of {', '.join(f'{r / 1e3:.6g}' for r in known)} kΩ" if known else ""
 
 
 def _model(found: StudyFits) -> str:
@@ -112,16 +151,13 @@ def _model(found: StudyFits) -> str:
 
 def _driver(found: StudyFits) -> str:
     drivers = list(found.drivers.values())
-    continuous = [driver for driver in drivers if isinstance(driver, ContinuousDriver)]
-    known = [driver.calibration.r_load for driver in continuous]
-    resistors = sorted(set(np.concatenate(known).tolist())) if known else []
     asked = found.settings.order if found.settings is not None else None
     orders = sorted({driver.order for driver in drivers})
     if found.by_current or not (asked or orders):
         return ""
     order = " or ".join(map(str, [asked] if asked else orders))
     text = f"Z_th is a rational function of order {order}"
-    if continuous:
+    if any(isinstance(driver, ContinuousDriver) for driver in drivers):
         text += ", stable by its modal parameters"
     if asked == 0:
         text += (
@@ -129,12 +165,10 @@ def _driver(found: StudyFits) -> str:
             "a score test nor Schwarz's criterion (1978) asks for another pole"
         )
     count = len(found.drivers) + len(found.failures)
-    text += ". It was identified from calibrations"
-    if count > 1:
-        text = text.replace("It was identified", f"It was identified for {count} drivers")
-    if resistors:
-        text += " with known resistors of "
-        text += ", ".join(f"{r / 1e3:.6g}" for r in resistors) + " kΩ"
+    whose = f" for {count} drivers" if count > 1 else ""
+    text += f". It was identified{whose} from calibrations"
+    if known := _resistors(found):
+        text += f" with known resistors{known}"
     methods = sorted({driver.method for driver in drivers})
     if methods:
         text += f", by {' or '.join(map(words, methods))}"

@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import several
 from etid.precision import in_float64
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.study import Study
+from etid.report import figures
 from etid.report import tables as study_tables
 from etid.report.html import Picture, Section, write_page
-from etid.report.methods import methods_section, words
-from etid.report.worst_fits import choose, relative_stderr
+from etid.report.methods import methods_section, succeeded, words
+from etid.report.waveforms import Recordings, relative_stderr, waveforms
 from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, own_part
@@ -51,8 +53,6 @@ def write_report(
             that is read.
         RecordingError: `recordings` is not a file of recordings.
     """
-    from etid.report.recordings import Recordings  # matplotlib is imported by the first picture
-
     file = None if isinstance(fits, StudyFits | Fits) else pathlib.Path(fits)
     if isinstance(fits, StudyFits):
         found = fits
@@ -68,9 +68,9 @@ def write_report(
     name = "fits" if file is None else file.name
     place = Recordings(found, file, recordings)
     try:
-        waveforms = _waveforms(found.fits, place)
+        drawn = waveforms(found.fits, place)
         if len(found.fits) == 1:
-            sections = [_single(found.fits), waveforms, _drivers(found), methods_section(found)]
+            sections = [_single(found.fits), drawn, _drivers(found), methods_section(found)]
         else:
             groups = found.fits.summary("subject", "condition")
             sections = [
@@ -79,9 +79,9 @@ def write_report(
                 _elements(found.fits, groups),
                 _subjects(found.fits, groups),
                 *_electrodes(found.fits),
-                _quality(found.fits, relative_stderr(found.fits)),
-                _recordings(found.fits, waveforms),
-                waveforms,
+                _quality(found.fits),
+                _recordings(found.fits, drawn),
+                drawn,
                 methods_section(found),
             ]
     finally:
@@ -100,7 +100,6 @@ def summary(found: StudyFits) -> str:
         path = str(fits.labels["path"][0])
         kind, method = type(fits.circuit).__name__, words(fits.fit.method)
         return f"One recording, {path or 'without a path'}, identified as {kind} by {method}."
-    good = fits.counts().get("successful", 0)
     source = pathlib.Path(settings.source).name if settings is not None else ""
     text = f"{len(fits)} recordings{f' of {source}' if source else ''}"
     for name, field in DESCRIBING.items():
@@ -111,10 +110,9 @@ def summary(found: StudyFits) -> str:
                 text += f", {name} {known.min():.4g} to {known.max():.4g} {field.unit}"
         elif name != "trial":
             count = len(set(map(str, column)) - {""})
-            text += f", {count} {name}{'s' if count > 1 else ''}" if count else ""
+            text += f", {several(count, name)}" if count else ""
     text += f", identified as {type(fits.circuit).__name__} by {words(fits.fit.method)}. "
-    share = f"{100 * good / len(fits):.1f} %"
-    return text + f"{good} fits ({share}) are successful; only these enter medians and spreads."
+    return text + succeeded(fits)
 
 
 def _verdicts(fits: Fits) -> Section:
@@ -123,8 +121,6 @@ def _verdicts(fits: Fits) -> Section:
 
 
 def _drivers(found: StudyFits) -> Section:
-    from etid.report import figures
-
     if found.by_current:
         text = "The loads were identified from their measured currents, which needs no driver."
         return Section("Drivers", text)
@@ -154,8 +150,6 @@ def _drivers(found: StudyFits) -> Section:
 
 
 def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
-    from etid.report import figures
-
     found = study_tables.components(fits, groups)
     if not found:
         return Section("Elements", warning="No fit is successful: there is nothing to average.")
@@ -198,8 +192,6 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
 
 
 def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
-    from etid.report import figures
-
     good = fits.successful()
     text = (
         "Medians of the successful fits, to two digits of their standard error. In per cent of the "
@@ -252,25 +244,21 @@ def _grouped(
     return Section(heading, text, (table,), pictures)
 
 
-def _quality(fits: Fits, stderr: np.ndarray) -> Section:
-    from etid.report import figures
-
-    good = fits.verdicts == "successful"
+def _quality(fits: Fits) -> Section:
+    good, failed = fits.successful(), int(np.sum(fits.verdicts != "successful"))
     pictures = ()
-    if good.any():
+    if len(good):
         caption = (
             "Successful fits: χ² per degree of freedom, 1 (dotted) where the residual is noise, "
             "and the standard error of the element that is known worst."
         )
         alt = "Histograms of χ² and of the largest relative standard error."
-        drawn = figures.quality(np.asarray(fits.chi2)[good], stderr[good])
+        drawn = figures.quality(np.asarray(good.chi2), relative_stderr(good))
         pictures = (Picture(caption, drawn, alt, whole=True),)
-    failed = int((~good).sum())
-    text = f"{failed} fits are without success." if failed else "All fits are successful."
-    if failed > study_tables.ROWS:
-        text += f" The first {study_tables.ROWS} are listed; the file of fits has all."
-    tables = (study_tables.failures(fits),) if failed else ()
-    return Section("Quality", text, tables, pictures)
+    text = "All fits are successful."
+    if failed:
+        text = f"{several(failed, 'fit')} without success; the table of recordings says why."
+    return Section("Quality", text, (), pictures)
 
 
 def _single(fits: Fits) -> Section:
@@ -300,33 +288,3 @@ def _recordings(fits: Fits, waveforms: Section) -> Section:
             "and every few of the others. The file of fits has all."
         )
     return Section("Recordings", text, (study_tables.recordings(fits, links),))
-
-
-def _waveforms(fits: Fits, place: Any) -> Section:
-    text = (
-        "First fits without success: for each verdict those with the largest χ². Then successful "
-        "fits with the largest χ² and with the largest standard error. One pulse of each."
-    )
-    chosen = {one.row: one.reason for one in choose(fits)}
-    all_drawn = len(fits) <= 24
-    if all_drawn:
-        chosen |= {row: "" for row in range(len(fits)) if row not in chosen}
-    if len(fits) == 1:
-        text = "One pulse."
-        chosen = {0: ""}
-    text += (
-        " If the model is right, the residual is noise. At the edges of a pulse it also contains "
-        "frequencies near half the sample rate, which are aliased and not fitted."
-    )
-    pictures, missing = [], []
-    for row, reason in chosen.items():
-        path = str(fits.labels["path"][row])
-        picture = place.picture(path, fits[row], reason, f"waveform-{row}")
-        if picture is None:
-            missing.append(f"{path} ({reason})" if reason else path)
-        else:
-            pictures.append(picture)
-    if missing:
-        text += f"\n\nThese recordings cannot be read and have no waveform: {', '.join(missing)}."
-    heading = "Waveforms" if all_drawn else "Worst fits"
-    return Section(heading, text, (), tuple(pictures), warning=place.problem)

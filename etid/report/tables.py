@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from etid.circuits.display import heading, plus_minus, scaled
+from etid.circuits.display import between, heading, plus_minus, scaled
 from etid.recordings.fields import LABELS
 from etid.report.html import Table
 from etid.results.driver import ContinuousDriver, Driver
@@ -40,8 +40,9 @@ def element(value: float, error: float, scale: float) -> str:
     """
     if not math.isfinite(value):
         return ""
-    if math.isfinite(error) and error >= abs(value):
-        return f"not determined (± {significant(error / scale)})"
+    if error >= abs(value):
+        size = significant(error / scale)
+        return f"not determined (± {size})" if size else "not determined"
     return " ".join(plus_minus(value / scale, error / scale).split())
 
 
@@ -113,10 +114,9 @@ class Components:
         median: Median of the successful fits [SI].
         low: 5 % quantile of the successful fits [SI].
         high: 95 % quantile of the successful fits [SI].
-        between_subjects: Standard deviation of the medians of the subjects.
-        between_recordings: Variation between the recordings of one subject, without noise.
-        own: Standard error from the noise of a recording.
-        shared: Standard error from the driver.
+        parts: Standard deviation of the medians of the subjects, variation between the recordings
+            of one subject without noise, standard error from the noise of a recording, and that
+            from the driver, each relative to the median; NaN if the study cannot determine it.
     """
 
     condition: str
@@ -126,20 +126,7 @@ class Components:
     median: float
     low: float
     high: float
-    between_subjects: float
-    between_recordings: float
-    own: float
-    shared: float
-
-    @property
-    def parts(self) -> dict[str, float]:
-        """The parts by name; NaN if the study cannot determine them."""
-        return {
-            "between subjects": self.between_subjects,
-            "between recordings": self.between_recordings,
-            "own error": self.own,
-            "shared error": self.shared,
-        }
+    parts: dict[str, float]
 
 
 def frequent(fits: Fits, count: int) -> list[str]:
@@ -183,10 +170,12 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
                     median=float(np.median(values)),
                     low=low,
                     high=high,
-                    between_subjects=spread / float(np.median(medians)),
-                    between_recordings=part("between"),
-                    own=part("own"),
-                    shared=part("shared"),
+                    parts={
+                        "between subjects": spread / float(np.median(medians)),
+                        "between recordings": part("between"),
+                        "own error": part("own"),
+                        "shared error": part("shared"),
+                    },
                 )
             )
     return found
@@ -204,7 +193,7 @@ def show_components(found: Sequence[Components], units: Mapping[str, str]) -> Ta
                 str(one.subjects),
                 str(one.successful),
                 significant(one.median / scale, 4),
-                f"{significant(one.low / scale, 3)} to {significant(one.high / scale, 3)}",
+                between(one.low / scale, one.high / scale, "1"),
                 *(significant(100 * value) for value in one.parts.values()),
             )
         )
@@ -255,7 +244,7 @@ def _typical(values: np.ndarray) -> float:
 
 
 def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
-    """One row for each recording: labels, verdict, elements and quality; at most `SINGLE`.
+    """One row for each recording: labels, verdict, elements, quality, note; at most `SINGLE`.
 
     Args:
         fits: All fits.
@@ -281,9 +270,13 @@ def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
                 *(element(columns[name][i], errors[name][i], scales[name]) for name in units),
                 significant(float(some.chi2[i]), 3),
                 significant(100 * float(some.rrse[i])),
+                own_part(str(verdict), str(some.notes[i])),
             )
         )
-    return Table((*heads, "χ²", "RRSE [%]"), tuple(rows), searchable=True, links=links)
+    heads += ["χ²", "RRSE [%]", "note"]
+    if not any(row[-1] for row in rows):
+        heads, rows = heads[:-1], [row[:-1] for row in rows]
+    return Table(tuple(heads), tuple(rows), searchable=True, links=links)
 
 
 def single(fits: Fits) -> Table:
@@ -308,24 +301,3 @@ def shown_rows(fits: Fits) -> np.ndarray:
     good = np.flatnonzero(fits.verdicts == "successful")
     some = good[np.linspace(0, good.size - 1, SINGLE - bad.size).round().astype(int)]
     return np.union1d(bad, some)
-
-
-def failures(fits: Fits) -> Table:
-    """The first recordings without success; at most `ROWS`."""
-    chosen = np.flatnonzero(fits.verdicts != "successful")[:ROWS]
-    some = fits.take(chosen)
-    rows = []
-    for i, verdict in enumerate(some.verdicts):
-        rows.append(
-            (
-                *(str(some.labels[name][i]) or "-" for name in ("path", "subject", "condition")),
-                str(verdict),
-                significant(float(some.chi2[i]), 3),
-                significant(100 * float(some.rrse[i])),
-                own_part(str(verdict), str(some.notes[i])),
-            )
-        )
-    heads = ("recording", "subject", "condition", "verdict", "χ²", "RRSE [%]", "note")
-    if not any(row[-1] for row in rows):
-        return Table(heads[:-1], tuple(row[:-1] for row in rows))
-    return Table(heads, tuple(rows))

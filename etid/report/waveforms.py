@@ -1,7 +1,8 @@
-"""Waveforms of single fits of a study, if the recordings are found."""
+"""Waveforms of single fits of a study, if the recordings are found, and which fits are shown."""
 
 import os
 import pathlib
+from collections.abc import Iterable
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,11 +13,14 @@ from etid.recordings.hdf5 import read
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.report.figures import plain, svg
-from etid.report.html import Picture
+from etid.report.html import Picture, Section
 from etid.report.tables import significant
 from etid.results.driver import Driver
 from etid.results.fit import Fit
+from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits
+
+FAILED, STRAINED, UNCERTAIN = 6, 3, 3  # largest number of fits of each kind
 
 
 class Recordings:
@@ -131,3 +135,85 @@ def _predicted(recording: Recording, fit: Fit, driver: Driver | None) -> tuple[F
         return figure_of(fit, recording, driver), why
     except ValueError as error:
         return figure_of(recording), f"{error}."
+
+
+def waveforms(fits: Fits, place: Recordings) -> Section:
+    """Measured and predicted pulses of the worst fits, or of all if they are few."""
+    text = (
+        "First fits without success: for each verdict those with the largest χ². Then successful "
+        "fits with the largest χ² and with the largest standard error. One pulse of each."
+    )
+    chosen = worst(fits)
+    all_drawn = len(fits) <= 24
+    if all_drawn:
+        chosen = dict.fromkeys(range(len(fits)), "") | chosen
+    if len(fits) == 1:
+        text = "One pulse."
+        chosen = {0: ""}
+    text += (
+        " If the model is right, the residual is noise. At the edges of a pulse it also contains "
+        "frequencies near half the sample rate, which are aliased and not fitted."
+    )
+    pictures, missing = [], []
+    for row, reason in chosen.items():
+        path = str(fits.labels["path"][row])
+        picture = place.picture(path, fits[row], reason, f"waveform-{row}")
+        if picture is None:
+            missing.append(f"{path} ({reason})" if reason else path)
+        else:
+            pictures.append(picture)
+    if missing:
+        text += f"\n\nThese recordings cannot be read and have no waveform: {', '.join(missing)}."
+    heading = "Waveforms" if all_drawn else "Worst fits"
+    return Section(heading, text, (), tuple(pictures), warning=place.problem)
+
+
+def relative_stderr(fits: Fits) -> np.ndarray:
+    """Largest relative standard error of the elements of each fit; NaN if one is NaN or both 0."""
+    with np.errstate(all="ignore"):  # an element without effect may be 0, a failed fit anything
+        stacked = np.stack(
+            [
+                np.asarray(getattr(fits.stderr, name))
+                / np.abs(np.asarray(getattr(fits.circuit, name)))
+                for name in fits.circuit.names()
+            ]
+        )
+    return np.where(np.isnan(stacked).any(axis=0), np.nan, stacked.max(axis=0))
+
+
+def worst(fits: Fits) -> dict[int, str]:
+    """Rows of the worst fits, with the reason: no success, then large χ², then large errors.
+
+    The fits without success have different verdicts if possible, frequent verdicts first. One cause
+    with many recordings therefore does not hide another. Among the fits with one verdict, the
+    largest χ² comes first.
+    """
+    names = fits.verdicts
+    chi2 = np.where(np.isfinite(fits.chi2), fits.chi2, -np.inf)
+    failing = [
+        _largest(np.flatnonzero(names == name), chi2)
+        for name in fits.counts()
+        if name != "successful"
+    ]
+    taken = dict.fromkeys(_in_turn(failing, FAILED), "without success")
+    good = np.flatnonzero(names == "successful")
+    for size, count, reason in (
+        (chi2, STRAINED, "largest χ² among the successful"),
+        (relative_stderr(fits), UNCERTAIN, "largest standard error among the successful"),
+    ):
+        known = good[np.isfinite(size[good])]
+        left = [row for row in _largest(known, size) if row not in taken]
+        taken |= dict.fromkeys(left[:count], reason)
+    return taken
+
+
+def _largest(rows: np.ndarray, size: np.ndarray) -> list[int]:
+    """The first rows in descending order of size; rows of equal size keep their order."""
+    order = np.argsort(-size[rows], kind="stable")[: FAILED + STRAINED + UNCERTAIN]
+    return rows[order].tolist()
+
+
+def _in_turn(queues: Iterable[list[int]], count: int) -> list[int]:
+    """The first row of each queue, then the second of each, and so on; at most `count`."""
+    ranked = [(place, i, row) for i, queue in enumerate(queues) for place, row in enumerate(queue)]
+    return [row for _, _, row in sorted(ranked)][:count]

@@ -1,4 +1,4 @@
-"""Changes of skin and driver from pulse to pulse, and electrodes that cannot be used.
+"""Tests of the pulses: for a change of skin or driver, and for a gain that is not the stated one.
 
 **The innovation** of a pulse is the difference between the logarithms of the elements that this
 pulse alone shows and their prediction:
@@ -32,31 +32,49 @@ variable for each electrode. Its deciles over n electrodes are ±1.282, with the
 of z, or of the z of the moving means, is `DRIVER` standard deviations above −1.282, or the upper
 one as far below 1.282. Half of the electrodes cannot do this. It is also the driver's if more than
 half of the electrodes jump at once. Skin that changes at all electrodes at once looks the same.
+
+**Gain.** A wrong gain 1 + g of V_out, or of the amplitude, lies nearly in the span of the elements:
+1 % moves R_p of dry skin by 20 %, and χ² of a pulse hardly shows it. Rao's score test finds what
+the elements and the delay of the pulse cannot imitate. Let r be the residual of a pulse in standard
+deviations, J its derivatives with respect to elements and delay, and d = G √w / σ. Then
+
+    d⊥ = d − Jᵀ (J Jᵀ)⁻¹ J d,      s = d⊥ᵀ r,      I = d⊥ᵀ d⊥
+
+are the score of g and its information. Elements and delay are free in each pulse, so that the
+scores do not depend on how the skin varies. While g is 0, those of different pulses have the mean 0
+and the variance I, and are independent but for the error of Z_th and the noise of the unloaded
+record. This part of s, with the standard deviation c, does not average out. With the sums over the
+pulses since the electrode began anew,
+
+    z² = (Σs)² / (ΣI + (Σc)²)
+
+has at most the distribution χ² with one degree of freedom. A gain g₀ that moves an element by
+`MOVED` does not matter (`etid.estimators.score_tests.other_circuit`), and instruments have smaller
+ones, which many pulses show. So a gain is wrong if it exceeds this one:
+
+    |Σs| − g₀ ΣI  >  SEEN_GAIN √(ΣI + (Σc)²).
+
+As in a fit of a whole record, the verdict is then `misfit`.
 """
 
-import dataclasses
-import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from etid.online.state import TrackerState
-from etid.results.verdicts import verdict_names
+from etid.estimators.score_tests.other_circuit import MOVED
+from etid.online.pulse_fit import Expected, Pulse
+from etid.signals.harmonics import real_parts
+from etid.signals.transfer import as_complex, power
 from etid.solvers.matrices import inverse_of_few
 
 FALSE_ALARMS = 0.05  # per electrode and hour, expected if T and Q have exactly their distributions
 WEIGHT = 0.1  # λ, of the newest innovation in the moving mean
 DRIVER = 9.0  # standard deviations; no false alarm is expected in a year
 COMMON = 8  # electrodes that are needed to tell the driver from the skin
-OPEN = 0.99  # effective gain above which an electrode touches nothing
-SHORTED = 0.02  # effective gain below which an electrode is shorted
-DRY = 700e3  # [Ω] at the lowest frequency; the driest fingertip of the paper's Table II has 686 kΩ
-RECENT = 60  # pulses for which an electrode that has drifted is called drifting
-NONE, JUMP, DRIFT = range(3)
-KINDS = ("none", "jump", "drift")
+SEEN_GAIN = 5.3  # standard deviations that noise exceeds once in 10⁷ pulses
 
 
 def limit(elements: int, pulse_rate: float) -> float:
@@ -146,56 +164,55 @@ def driver_change(
     return enough & (moved | (jnp.sum(jumped & counts, dtype=float) > number / 2))
 
 
-@dataclasses.dataclass(frozen=True)
-class Change:
-    """A change that a pulse has shown.
+class GainScore(NamedTuple):
+    """Score of the gain of one pulse, and sums of several.
 
     Attributes:
-        pulse: Number of the pulse since the start, from 1 on.
-        electrode: Number of the electrode; None if the driver has changed.
-        kind: `jump`, `drift`, or `driver`.
-        element: Name of the element that explains the change best; empty for the driver.
-        factor: New value of this element divided by the old one; NaN for the driver.
+        sums: s, I and c.
+        moved: Change of the logarithms of the elements for each unit of g.
     """
 
-    pulse: int
-    electrode: int | None
-    kind: str
-    element: str
-    factor: float
+    sums: Float[Array, "*lane 3"]
+    moved: Float[Array, "*lane element"]
 
+    @classmethod
+    def of(
+        cls,
+        pulse: Pulse,
+        variance: Float[Array, ""],
+        expected: Expected,
+        residual: Float[Array, " part"],
+        inverse: Float[Array, "own own"],
+    ) -> "GainScore":
+        """The score of a pulse.
 
-def changes(state: TrackerState, names: tuple[str, ...]) -> list[Change]:
-    """The changes that the last pulse has shown; see `Tracker.changes`."""
-    number, lanes = int(state.number), state.electrodes
-    if state.driver_event:
-        return [Change(number, None, "driver", "", math.nan)]
-    event, element, factor = map(np.asarray, (lanes.event, lanes.element, lanes.factor))
-    return [
-        Change(
-            number,
-            int(at),
-            KINDS[event[at]],
-            names[element[at]],
-            float(np.exp(factor[at, element[at]])),
-        )
-        for at in np.flatnonzero(event != NONE)
-    ]
+        Args:
+            pulse: The objective.
+            variance: E|noise|² of a Fourier coefficient of V_out [V²].
+            expected: Gain near the minimum.
+            residual: Residual at the minimum, but for a step along the elements and the delay.
+            inverse: (J Jᵀ)⁻¹.
+        """
+        gain, model = expected.gain, pulse.model
+        weighted = gain * as_complex(jnp.sqrt(pulse.weight))
+        jacobian, along = pulse.jacobian(expected), real_parts(weighted)
+        others = inverse @ (jacobian @ along)
+        d = along - others @ jacobian
+        score, information = d @ residual, d @ d
+        freedom = 2 * jnp.sum(pulse.weight > 0, dtype=score.dtype) - others.size - 1
+        chi2 = (residual @ residual - score**2 / information) / freedom
+        # ∂G/∂ log Z_th = −G (1 − G)
+        towards = jax.lax.complex(*jnp.split(d, 2)) * jnp.conj(weighted * (1 - gain))
+        of_source = model.source_error.real @ towards.real + model.source_error.imag @ towards.imag
+        of_x = power(gain) * model.bands.variance_x / variance
+        common = jnp.sqrt(of_source @ of_source + d**2 @ jnp.tile(of_x, 2))
+        # More noise than stated lessens the weight of a pulse, as it does in a fit of a record.
+        sums = jnp.stack([score, information, common]) / jnp.maximum(chi2, 1.0)
+        return cls(sums, -others[:-1])
 
-
-def bad_electrodes(state: TrackerState, impedance: Float[np.ndarray, " lane"]) -> dict[int, str]:
-    """Electrodes that cannot be used, with the reason; see `Tracker.bad_electrodes`."""
-    lanes = state.electrodes
-    known = np.asarray(lanes.pulses) > 0
-    since = int(state.number) - np.asarray(lanes.drifted)
-    reasons = {
-        "open": verdict_names(lanes.result) == "unconnected",
-        "shorted": np.asarray(lanes.level) < SHORTED,
-        "dry": known & (impedance > DRY),
-        "drifting": (np.asarray(lanes.drifted) >= 0) & (since < RECENT),
-    }
-    found: dict[int, str] = {}
-    for reason, applies in reasons.items():
-        for electrode in np.flatnonzero(applies):
-            found.setdefault(int(electrode), reason)
-    return dict(sorted(found.items()))
+    def wrong(self) -> Bool[Array, ""]:
+        """Whether sums over pulses show another gain that matters."""
+        score, information, common = self.sums
+        scatter = jnp.sqrt(information + common**2)
+        moved = jnp.max(jnp.abs(self.moved))
+        return moved * (jnp.abs(score) - SEEN_GAIN * scatter) > MOVED * information
