@@ -22,7 +22,7 @@ from benchmarks.problem import START, ByNumPy, Problem, harmonics, terms
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_start import start_of_skin
 from etid.estimators.maximum_likelihood.search import WELL
-from etid.identify.batches import each
+from etid.identify.fitting import each
 
 SIDE_BY_SIDE = 98
 BY_SCIPY = 8  # lanes

@@ -14,7 +14,7 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.one import known_of
+from etid.identify.fitting import known_of
 from etid.recordings.preflight import Inspected
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial

@@ -39,12 +39,12 @@ from .identify.impedance import identify_impedance as identify_impedance
 from .identify.jointly import identify_jointly as identify_jointly
 from .identify.kramers_kronig import KramersKronig as KramersKronig
 from .identify.kramers_kronig import kramers_kronig as kramers_kronig
-from .identify.many import identify_skins as identify_skins
-from .identify.many import identify_study as identify_study
-from .identify.one import identify_skin as identify_skin
 from .identify.predict import predict as predict
 from .identify.samples import identify_samples as identify_samples
-from .identify.selecting import select_circuit as select_circuit
+from .identify.skins import identify_skin as identify_skin
+from .identify.skins import identify_skins as identify_skins
+from .identify.skins import select_circuit as select_circuit
+from .identify.study import identify_study as identify_study
 from .online.controller import Controller as Controller
 from .online.tracker import Tracker as Tracker
 from .plotting import plot as plot

@@ -12,7 +12,6 @@ from benchmarks.selection_draws import choices
 from etid.circuits.elements import Farad, Ohm, PseudoCapacitance
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.starts import circuit_starts
-from etid.identify.one import note
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
 from etid.results.fit import CHANGES, Fit, Support

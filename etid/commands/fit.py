@@ -15,9 +15,9 @@ from etid.circuits.display import DISPLAY, heading, several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.commands.circuits import add_circuit
 from etid.estimators import registry
+from etid.identify.arguments import order_of
 from etid.identify.file import fit_file, kept, processes
 from etid.identify.jointly import identify_jointly
-from etid.identify.options import order_of
 from etid.recordings import hdf5
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import HDF5, claimed

@@ -24,9 +24,10 @@ from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import check_distinct, circuit_of, driver_of, fed
 from etid.identify.arguments import recordings as list_of
-from etid.identify.one import known_of, remarks_on, successful
+from etid.identify.fitting import known_of, remarks_on
 from etid.identify.options import Interval, Options, plan
 from etid.identify.planning import failed_fit
+from etid.identify.skins import successful
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected

@@ -15,7 +15,7 @@ from etid.estimators.registry import Method
 from etid.estimators.score_tests import resistors
 from etid.identify import changes
 from etid.identify.arguments import check_distinct, recordings
-from etid.identify.one import checksum, needs_another, of_both
+from etid.identify.fitting import better_of, checksum, may_hum
 from etid.identify.options import Options, check_instrument, check_order, for_calibrations
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
@@ -216,10 +216,10 @@ def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator
     driver = _identified(records, r_load, order, estimator)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
     # elsewhere.
-    if needs_another(driver) or driver.verdict != "successful":
+    if may_hum(driver) or driver.verdict != "successful":
         few = records.selected & ~mains.lines(records.frequency)
         records = dataclasses.replace(records, selected=few)
-        driver = of_both(driver, _identified(records, r_load, order, estimator))
+        driver = better_of(driver, _identified(records, r_load, order, estimator))
     return driver
 
 

@@ -40,7 +40,7 @@ from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import minimum as least
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
-from etid.identify.one import is_shared, known_of, skin
+from etid.identify.fitting import is_shared, known_of, skin
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
@@ -234,7 +234,7 @@ def given(
     seen = Inspected(recording)
     estimator = cast(MaximumLikelihood, named(fit.method))
     lane = (HarmonicsWithCurrent if estimator.with_current else Harmonics).of(seen)
-    late = lane.late_by(fit.circuit, feed)  # as `etid.identify.one.repeated` does it
+    late = lane.late_by(fit.circuit, feed)  # as `etid.identify.fitting.refitted` does it
     seen.realign(*late)
     lane = lane.realigned(late)
     if int(fit.remarks) & Remark.mains_hum:

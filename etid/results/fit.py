@@ -207,7 +207,7 @@ class Fit(Judged, HasSource[Circuit]):
 
         self._refuse_batch()
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self)
-        Fits(batch, described([{}]), np.array([message(self.verdict)])).write(path)
+        Fits(batch, described([{}]), np.array([self.note])).write(path)
 
     def _refuse_batch(self) -> None:
         if np.ndim(self.rrse):
@@ -279,6 +279,16 @@ class Fit(Judged, HasSource[Circuit]):
             return ""
         return f"{looks_like(z)} Another circuit is the likelier cause: try circuit='auto' first."
 
+    @property
+    def note(self) -> str:
+        """The message of the verdict, with the numbers that explain it; for one fit."""
+        return " ".join(self._reasons)
+
+    @property
+    def _reasons(self) -> list[str]:
+        own = {"changed": self.changes, "out_of_bounds": self.outside}.get(self.verdict, "")
+        return [*filter(None, (self.other_circuit, message(self.verdict), own))]
+
     def _overview(self) -> Overview:
         kind, verdict = type(self.circuit).__name__, self.verdict
         values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
@@ -290,8 +300,6 @@ class Fit(Judged, HasSource[Circuit]):
         title += f", RRSE {100 * float(self.rrse):.3g} %"
         if self.measured is None or self.measured.stderr is not None:
             title += f", chi2 {float(self.chi2):.3g}"  # without standard errors there is none
-        notes = [message(verdict)] if verdict != "successful" else []
-        notes += [self.changes] if verdict == "changed" else []
-        notes = [self.other_circuit, *notes] if self.other_circuit else notes
-        notes += [self.outside] if self.outside else []
-        return Overview(title, rows, notes=[*notes, *texts(int(self.remarks))])
+        outside = "" if verdict == "out_of_bounds" else self.outside
+        notes = [*self._reasons, *filter(None, [outside]), *texts(int(self.remarks))]
+        return Overview(title, rows, notes=notes)
