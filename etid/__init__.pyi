@@ -55,11 +55,11 @@ from .recordings.recording import RecordingError as RecordingError
 from .recordings.recording import Samples as Samples
 from .recordings.study import Study as Study
 from .report.study import write_report as write_report
-from .results.budget import Budget as Budget
 from .results.driver import Driver as Driver
 from .results.fit import Fit as Fit
 from .results.fit import IdentificationError as IdentificationError
 from .results.fits import Fits as Fits
+from .results.instrument import Budget as Budget
 from .results.instrument import Instrument as Instrument
 from .results.posterior import Posterior as Posterior
 from .results.posterior import Profile as Profile

@@ -14,8 +14,7 @@ from benchmarks.specimens import study_fits
 from etid import cli
 from etid.identify import file as files
 from etid.identify.options import Options
-from etid.results.provenance import PLAUSIBLE
-from etid.results.study_fits import StudyFits
+from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 

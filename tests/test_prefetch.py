@@ -6,8 +6,8 @@ import pytest
 
 import etid
 from etid.identify import study as of_study
-from etid.identify.batches import prefetch
 from etid.identify.options import Options
+from etid.identify.planning import prefetch
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 

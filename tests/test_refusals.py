@@ -15,9 +15,10 @@ import pytest
 
 import etid
 from etid import IdentificationError, RecordingError
+from etid.circuits.impedance import realise
 from etid.plotting import figure_of
 from etid.plotting.style import new_figure, save
-from etid.results.driver import ContinuousDriver, realise
+from etid.results.driver import ContinuousDriver
 from etid.results.verdicts import verdict
 from etid.signals.transfer import Rational
 from etid.simulation.scenes import Scene, Trial

@@ -22,10 +22,9 @@ from etid.recordings import hdf5
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import HDF5, claimed
 from etid.report.html import Table
-from etid.results.instrument import LARGEST, Instrument
-from etid.results.provenance import PLAUSIBLE
-from etid.results.study_fits import StudyFits
-from etid.results.tried_orders import Order
+from etid.results.driver import Order
+from etid.results.instrument import TOLERANCES, Instrument
+from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.results.verdicts import message, own_part
 
 
@@ -181,8 +180,8 @@ def _several(option: str, known: list[tuple[str, list[Any]]], count: int) -> dic
 def _instrument(told: list[tuple[str, list[Any]]]) -> Instrument | None:
     """The tolerances of --tolerance."""
     for name, _ in told:
-        if name not in LARGEST:
-            raise ValueError(f"--tolerance knows no {name!r}; write {', '.join(LARGEST)}")
+        if name not in TOLERANCES:
+            raise ValueError(f"--tolerance knows no {name!r}; write {', '.join(TOLERANCES)}")
     return Instrument(**_several("--tolerance", told, 1)) if told else None
 
 

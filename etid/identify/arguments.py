@@ -14,10 +14,9 @@ from etid.estimators.element_prior import Known
 from etid.recordings.errors import not_recorded
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
-from etid.results.driver import Driver
+from etid.results.driver import AUTO, Driver, Order
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
-from etid.results.provenance import PLAUSIBLE
-from etid.results.tried_orders import AUTO, Order
+from etid.results.study_fits import PLAUSIBLE
 
 # Four times the order of the paper. Calibrations determine no more poles; with 50 poles an
 # identification takes minutes and does not converge.

@@ -23,11 +23,10 @@ from etid.precision import in_float64
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
-from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
+from etid.results.driver import AUTO, ContinuousDriver, Driver, HarmonicDriver, Order
 from etid.results.fit import IdentificationError
 from etid.results.instrument import Instrument
-from etid.results.provenance import PLAUSIBLE
-from etid.results.tried_orders import AUTO, Order
+from etid.results.study_fits import PLAUSIBLE
 from etid.results.verdicts import message, verdict
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 from etid.signals import mains

@@ -36,10 +36,9 @@ from etid.precision import in_float64
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import claimed, replace_text
+from etid.results.driver import Order
 from etid.results.instrument import Instrument
-from etid.results.provenance import PLAUSIBLE
-from etid.results.study_fits import StudyFits
-from etid.results.tried_orders import Order
+from etid.results.study_fits import PLAUSIBLE, StudyFits
 
 PART = 256  # recordings, some seconds of work; a killed run loses at most one part
 

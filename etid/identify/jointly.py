@@ -40,7 +40,6 @@ from etid.estimators.registry import register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import shape_of
 from etid.identify.arguments import check_new, require
-from etid.identify.batches import batches
 from etid.identify.fitting import (
     Batch,
     Prepared,
@@ -53,19 +52,17 @@ from etid.identify.fitting import (
     remarks_on,
 )
 from etid.identify.options import Circuit, Interval, Options, candidates_of
-from etid.identify.planning import Refusal, failed_fit
+from etid.identify.planning import Refusal, batches, failed_fit
 from etid.identify.study import Drivers, common_first, fields_of, table
 from etid.numpy_tier.tiers import program, worth_compiling
 from etid.precision import in_float64
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.recordings.study import Study
-from etid.results.driver import HarmonicDriver
+from etid.results.driver import HarmonicDriver, Order
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
-from etid.results.provenance import PLAUSIBLE
-from etid.results.study_fits import StudyFits
-from etid.results.tried_orders import Order
+from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.results.verdicts import RESULTS, verdict, verdict_names, verdicts_of
 from etid.selection.delays import upper_limit
 

@@ -37,11 +37,10 @@ from etid.identify.arguments import (
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import RecordingError
 from etid.recordings.study import Study
-from etid.results.driver import ContinuousDriver, HarmonicDriver
+from etid.results.driver import AUTO, ContinuousDriver, HarmonicDriver, Order
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.instrument import Instrument
-from etid.results.provenance import PLAUSIBLE, Settings, versions
-from etid.results.tried_orders import AUTO, Order
+from etid.results.study_fits import PLAUSIBLE, Settings, versions
 from etid.selection.search import usual_circuits
 
 Circuit = AbstractCircuit | str | None

@@ -1,18 +1,28 @@
-"""Reading and inspection of recordings: which can be fitted, and why the others cannot."""
+"""Reading and inspection of recordings: which can be fitted, and why the others cannot.
 
+During a fit, a thread reads the next recordings in chunks. A bad recording gets a verdict and a
+note; the other recordings are not affected.
+"""
+
+import collections
+import contextlib
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+import operator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
 from etid.estimators.element_limits import limited, of_circuit
 from etid.estimators.lanes import AbstractLane
 from etid.identify import changes
-from etid.identify.fitting import FEWEST, Prepared, is_shared
+from etid.identify.fitting import FEWEST, Batch, Prepared, is_shared
 from etid.identify.options import Options, check_default, plan
+from etid.precision import in_float64
 from etid.recordings.causes import why_implausible, why_misaligned
 from etid.recordings.preflight import Group, Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
@@ -22,9 +32,11 @@ from etid.results.verdicts import message, verdict
 
 TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB
 MOST = 64  # recordings that are read at once if they are short; many more save little time
+AHEAD = 2  # chunks that are read and inspected in advance
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 # Verdicts whose message says more of a recording.
 EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
+T = TypeVar("T")
 
 Load = Callable[[int], tuple[Recording, AbstractFeed]]
 """Reads the recording of a row, and its driver. Its error becomes the verdict of this row."""
@@ -111,6 +123,76 @@ def _inspected(
             group = Group([of for _, of, _ in part])
             for number, (row, of, driver) in enumerate(part):
                 yield row, Inspected(of, group, number), driver
+
+
+def prefetch(
+    load: Callable[[int], T], count: int, ahead: int
+) -> Generator[Callable[[], T], None, None]:
+    """Call `load(0)`, `load(1)`, … in another thread, in this order and one at a time.
+
+    Close the iterator to stop early: the running call finishes, the others do not start.
+
+    Args:
+        load: A function that spends its time outside Python, in file access or numpy.
+        count: Number of calls.
+        ahead: Largest number of calls in advance of the caller.
+
+    Yields:
+        For each call a function that waits for the result and returns it, or raises its error.
+    """
+    with ThreadPoolExecutor(1, thread_name_prefix="prefetch") as thread:
+        waiting = collections.deque(thread.submit(load, row) for row in range(min(ahead, count)))
+        try:
+            for row in range(count):
+                loaded = waiting.popleft()
+                if row + ahead < count:
+                    waiting.append(thread.submit(load, row + ahead))
+                yield loaded.result
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def batches(
+    count: int,
+    load: Load,
+    options: Options,
+    progress: bool = False,
+    key: Callable[[Prepared], tuple[Any, ...]] = operator.attrgetter("key"),
+) -> Iterator[tuple[int, Refusal] | Batch]:
+    """All recordings in batches, and those that cannot be fitted.
+
+    Args:
+        count: Number of recordings.
+        load: Reads a recording and its driver.
+        options: What the caller asks for.
+        progress: Show a progress bar.
+        key: Equal for recordings of one batch.
+    """
+    waiting: dict[tuple[Any, ...], Batch] = {}
+    rows = iter(range(count))
+
+    @in_float64  # the setting belongs to a thread, and this runs in another one
+    def read(_: int) -> list[tuple[int, Prepared | Refusal]]:
+        return prepared(load, rows, options)
+
+    with (
+        tqdm(total=count, unit="fit", disable=not progress) as bar,
+        contextlib.closing(prefetch(read, len(calls(count)), AHEAD)) as chunks,
+    ):
+        for row, one in itertools.chain.from_iterable(chunk() for chunk in chunks):
+            if isinstance(one, Refusal):
+                yield row, one
+                bar.update()
+                continue
+            batch = waiting.setdefault(key(one), Batch(one))
+            batch.add(row, one)
+            if batch.full:
+                bar.update(len(batch.rows))
+                yield waiting.pop(key(one))
+        for batch in waiting.values():
+            bar.update(len(batch.rows))
+            yield batch
 
 
 def explained(seen: Inspected, name: str) -> str:

@@ -12,7 +12,6 @@ from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.registry import Method
 from etid.identify.arguments import driver_of, fed, given_circuit
 from etid.identify.arguments import recordings as several
-from etid.identify.batches import of_one_circuit
 from etid.identify.fitting import Batch, Prepared, is_shared
 from etid.identify.impedance import identify_impedance
 from etid.identify.options import (
@@ -25,7 +24,7 @@ from etid.identify.options import (
     plan,
 )
 from etid.identify.planning import EXPLAINED, explained, failed_fit
-from etid.identify.study import fields_of, table
+from etid.identify.study import fields_of, of_one_circuit, table
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording, RecordingError

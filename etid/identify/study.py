@@ -2,31 +2,34 @@
 
 import dataclasses
 import functools
+import itertools
+import math
 import threading
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from etid.estimators.registry import Method
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.lanes import stacked, taken, unstacked
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import require
-from etid.identify.batches import choices, of_one_circuit
 from etid.identify.driver import calibrated
+from etid.identify.fitting import Batch, CandidateFits, notes_of
 from etid.identify.options import Circuit, Interval, Options, candidates_of
-from etid.identify.planning import Load
+from etid.identify.planning import Load, batches, failed_fit
 from etid.precision import in_float64
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
-from etid.results.driver import Driver
+from etid.results.driver import Driver, Order
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
 from etid.results.fit import Fit, IdentificationError
-from etid.results.fits import Fits
+from etid.results.fits import Fits, concatenated
 from etid.results.fits_columns import described
 from etid.results.instrument import Instrument
-from etid.results.provenance import PLAUSIBLE
-from etid.results.study_fits import StudyFits
-from etid.results.tried_orders import Order
-from etid.selection.common import common
+from etid.results.study_fits import PLAUSIBLE, StudyFits
+from etid.selection.common import common, deserves
+from etid.selection.selection import Selection
 
 SAMPLE = 200  # recordings that choose the circuit of a study; a second of work
 
@@ -200,3 +203,101 @@ class Drivers:
             self.found[names] = calibrated(records, self.options, throw=False)
         except (IdentificationError, ValueError, KeyError) as error:
             self.failures[names] = str(error)
+
+
+class _Part(NamedTuple):
+    """Fits of some recordings, and why they were refused if they were."""
+
+    rows: list[int]
+    found: CandidateFits
+    note: str = ""
+
+
+def _parts(count: int, load: Load, options: Options, progress: bool, total: int) -> Iterator[_Part]:
+    """Fits of all recordings, in parts; arguments as in `choices`."""
+    otherwise = str(options.estimator or MAXIMUM_LIKELIHOOD)
+    for batch in batches(count, load, options, progress):
+        if isinstance(batch, Batch):
+            yield _Part(batch.rows, batch.fitted(options.circuits, total))
+        else:
+            row, refusal = batch
+            fit = failed_fit(refusal.name, options, otherwise)
+            yield _Part([row], CandidateFits(stacked([fit])), refusal.note)
+
+
+def choices(
+    count: int, load: Load, options: Options, progress: bool, total: int
+) -> tuple[list[Selection], list[str]]:
+    """A choice for each recording alone, and notes.
+
+    Args:
+        count: Number of recordings.
+        load: Reads a recording and its driver.
+        options: What the caller asks for.
+        progress: Show a progress bar.
+        total: Number of recordings that are fitted in this way, here and in other calls.
+    """
+    found: dict[int, Selection] = {}
+    notes = [""] * count
+    for part in _parts(count, load, options, progress, total):
+        for number, row in enumerate(part.rows):
+            found[row] = Selection.of(
+                part.found[number], part.found.chosen(number), options.circuits
+            )
+            notes[row] = part.note or found[row].fit.note
+    return [found[row] for row in range(count)], notes
+
+
+def _fits(
+    count: int, load: Load, options: Options, progress: bool, total: int
+) -> tuple[Fit, list[str]]:
+    """The fit of the only circuit to each recording, stacked, and notes; see `choices`."""
+    parts = list(_parts(count, load, options, progress, total))
+    of_parts = [[part.note] if part.note else notes_of(part.found.only) for part in parts]
+    order = np.argsort([row for part in parts for row in part.rows])
+    fits = taken(concatenated([part.found.only for part in parts]), order)
+    texts = list(itertools.chain.from_iterable(of_parts))
+    return fits, [texts[place] for place in order]
+
+
+def of_one_circuit(
+    count: int,
+    load: Load,
+    options: Options,
+    progress: bool,
+    total: int,
+    chosen: int | None = None,
+) -> tuple[Fit, list[str]]:
+    """Fits, stacked, and notes of recordings, all with the same circuit.
+
+    Args:
+        count: Number of recordings.
+        load: Reads a recording and its driver.
+        options: What the caller asks for; joint evidence chooses the circuit.
+        progress: Show a progress bar.
+        total: As in `choices`.
+        chosen: Number of the circuit, if it is chosen already. The other circuits then serve to
+            find the recordings that deserve another circuit.
+    """
+    circuits = options.circuits
+    if len(circuits) == 1:
+        return _fits(count, load, options, progress, total)
+    found, notes = choices(count, load, options, progress, total)
+    chosen = common(found, circuits) if chosen is None else chosen
+    others = [row for row, one in enumerate(found) if one.chosen != chosen]
+    if others:
+        single = dataclasses.replace(options, circuits=(circuits[chosen],))
+        again, texts = _fits(len(others), lambda i: load(others[i]), single, False, total)
+        for row, one, text in zip(others, unstacked(again), texts, strict=True):
+            found[row], notes[row] = _otherwise(found[row], one, text, chosen, circuits)
+    return concatenated([stacked([one.fit]) for one in found]), notes
+
+
+def _otherwise(
+    found: Selection, fit: Fit, text: str, chosen: int, candidates: Sequence[AbstractCircuit]
+) -> tuple[Selection, str]:
+    """The choice and the note of a recording whose common circuit is not its own choice."""
+    if not math.isfinite(float(fit.chi2)):  # it was refused
+        return Selection.of({chosen: fit}, chosen, candidates), text
+    found = Selection.of({**found.fits, chosen: fit}, chosen, candidates)
+    return found, " ".join(filter(None, (text, deserves(found, chosen))))
