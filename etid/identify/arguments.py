@@ -89,6 +89,31 @@ def check_distinct(field: str, recordings: Sequence[Recording]) -> None:
         check_new(f"{field}[{number}]", one, first)
 
 
+def check_alike(field: str, recordings: Sequence[Recording]) -> None:
+    """Refuse recordings of different lengths or rates.
+
+    Raises:
+        RecordingError: There is none, or one differs from the first.
+    """
+    if not recordings:
+        raise RecordingError("is empty", field=field, remedy="Pass the recordings in a list")
+
+    def of(one: Recording) -> tuple[float, float, int]:
+        return one.sample_rate, one.pulse_rate, one.samples["v_out"].stored.size
+
+    for number, one in enumerate(recordings):
+        for name, value, first in zip(
+            ("sample_rate", "pulse_rate", "samples"), of(one), of(recordings[0]), strict=True
+        ):
+            if value != first:
+                raise RecordingError(
+                    f"has {name} {value:g}, the first {first:g}",
+                    path=one.path,
+                    field=f"{field}[{number}]",
+                    remedy="Record all with the same settings, or cut them to one length",
+                )
+
+
 def check_new(field: str, recording: Recording, first: dict[bytes, str]) -> None:
     """Refuse a recording with the samples of an earlier one; `check_distinct` for a stream.
 

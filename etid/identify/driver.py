@@ -14,7 +14,7 @@ from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
 from etid.estimators.registry import Method
 from etid.estimators.score_tests import resistors
 from etid.identify import changes
-from etid.identify.arguments import check_distinct, recordings
+from etid.identify.arguments import check_alike, check_distinct, recordings
 from etid.identify.fitting import better_of, checksum, may_hum
 from etid.identify.options import Options, check_instrument, check_order, for_calibrations
 from etid.identify.planning import explained
@@ -102,12 +102,7 @@ def calibrated(
                 "The calibrations of a study are study.calibrations"
             )
         resistances.append(record.r_load)
-    sizes = {(record.v_th.size, record.sample_rate, record.pulse_rate) for record in records}
-    if len(sizes) > 1:
-        raise ValueError(
-            f"calibrations differ in (samples, sample rate, pulse rate): {sorted(sizes)}; "
-            "cut them to one length"
-        )
+    check_alike("calibrations", records)
     check_distinct("calibrations", records)
     seen = [Inspected(record) for record in records]
     for one in seen:

@@ -17,7 +17,6 @@ from etid.circuits.display import quantity, several
 from etid.circuits.overview import Overview, element_rows
 from etid.recordings.remarks import texts, words
 from etid.results.data import HasSource
-from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, Judged, counted, message
 from etid.signals.transfer import power
 
@@ -279,6 +278,7 @@ class Fit(Judged, HasSource[Circuit]):
             ValueError: This is a batch.
         """
         from etid.results.fits import Fits  # a table of this class
+        from etid.results.fits_columns import described
 
         self._refuse_batch()
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self)
