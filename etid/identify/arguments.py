@@ -98,20 +98,18 @@ def check_alike(field: str, recordings: Sequence[Recording]) -> None:
     if not recordings:
         raise RecordingError("is empty", field=field, remedy="Pass the recordings in a list")
 
-    def of(one: Recording) -> tuple[float, float, int]:
-        return one.sample_rate, one.pulse_rate, one.samples["v_out"].stored.size
+    def of(one: Recording) -> str:
+        size = one.samples["v_out"].stored.size
+        return f"{size} samples, sample_rate {one.sample_rate} Hz, pulse_rate {one.pulse_rate} Hz"
 
     for number, one in enumerate(recordings):
-        for name, value, first in zip(
-            ("sample_rate", "pulse_rate", "samples"), of(one), of(recordings[0]), strict=True
-        ):
-            if value != first:
-                raise RecordingError(
-                    f"has {name} {value:g}, the first {first:g}",
-                    path=one.path,
-                    field=f"{field}[{number}]",
-                    remedy="Record all with the same settings, or cut them to one length",
-                )
+        if of(one) != of(recordings[0]):
+            raise RecordingError(
+                f"has {of(one)}; the first has {of(recordings[0])}",
+                path=one.path,
+                field=f"{field}[{number}]",
+                remedy="Record all with the same settings, or cut them to one length",
+            )
 
 
 def check_new(field: str, recording: Recording, first: dict[bytes, str]) -> None:
