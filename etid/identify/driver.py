@@ -195,22 +195,14 @@ def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator)
 def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
     """The driver from calibrations that passed the pre-flight, aligned by their lags."""
     r_load = jax.device_put(np.asarray([one.recording.r_load for one in seen]))
-    if not estimator.lane.periodic:
-        aligned = [AlignedSamples.of(one) for one in seen]
-        size = min(one.size for one in aligned)
-        cut = [
-            dataclasses.replace(one, v_th=one.v_th[:size], v_out=one.v_out[:size])
-            for one in aligned
-        ]
-        return _identified(stacked(cut), r_load, order, estimator)
-    lanes = [Harmonics.of(one) for one in seen]
+    kind = Harmonics if estimator.lane.periodic else AlignedSamples
+    lanes = [kind.of(one) for one in seen]
     size = min(one.size for one in lanes)  # counted pulse rates may differ by one harmonic
-    lanes = [jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes]
-    records = stacked(lanes)
+    records = stacked([jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes])
     driver = _identified(records, r_load, order, estimator)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
     # elsewhere.
-    if may_hum(driver) or driver.verdict != "successful":
+    if isinstance(records, Harmonics) and (may_hum(driver) or driver.verdict != "successful"):
         few = records.selected & ~mains.lines(records.frequency)
         records = dataclasses.replace(records, selected=few)
         driver = better_of(driver, _identified(records, r_load, order, estimator))

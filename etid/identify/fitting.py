@@ -428,18 +428,19 @@ class Batch:
         self.rows: list[int] = []
         self.lanes: list[AbstractLane] = []
         self.seen: list[Inspected] = []
+        self._samples = 0
 
     def add(self, row: int, one: Prepared) -> None:
         """Append a recording."""
         self.rows.append(row)
         self.lanes.append(one.lane)
         self.seen.append(one.seen)
+        self._samples += one.seen.recording.samples["v_out"].stored.size
 
     @property
     def full(self) -> bool:
         """Whether a call has its lanes, or the recordings take much memory."""
-        held = sum(one.recording.samples["v_out"].stored.size for one in self.seen)
-        return len(self.rows) == LANES or (len(self.rows) >= FEWEST and held >= HELD)
+        return len(self.rows) == LANES or (len(self.rows) >= FEWEST and self._samples >= HELD)
 
     def fitted(self, candidates: Sequence[AbstractCircuit], total: int) -> CandidateFits:
         """The fits, with their verdicts.

@@ -17,6 +17,7 @@ from etid.circuits.display import quantity, several
 from etid.circuits.overview import Overview, element_rows
 from etid.recordings.remarks import texts, words
 from etid.results.data import HasSource
+from etid.results.posterior import tails
 from etid.results.verdicts import RESULTS, Judged, counted, message
 from etid.signals.transfer import power
 
@@ -235,9 +236,7 @@ class Fit(Judged, HasSource[Circuit]):
             ValueError: The level is not between 0 and 1, or this is a batch.
         """
         self._refuse_batch()
-        if not 0 < level < 1:
-            raise ValueError(f"level is {level}; it must be between 0 and 1, as in 0.95")
-        z = statistics.NormalDist().inv_cdf((1 + level) / 2)
+        z = statistics.NormalDist().inv_cdf(tails(level)[1])
         values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
         low, high = values - z * errors, values + z * errors
         if self.limits is not None:
