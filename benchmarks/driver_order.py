@@ -29,7 +29,7 @@ from benchmarks.perturbed_study import PARTS
 from benchmarks.rates import NORMAL_95
 from benchmarks.runner import Target, at_least, option, report
 from benchmarks.spice import DATA, FOLDER, imported
-from etid.results.tried_orders import AUTO, Order
+from etid.results.driver import AUTO, Order
 from etid.simulation.scenes import Scene
 
 AS_GOOD = 1.1  # of 20 drivers with two skins, a root mean square is known to about 10 %

@@ -25,7 +25,7 @@ from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.registry import named, names
 from etid.identify.options import for_calibrations
 from etid.recordings.preflight import Inspected
-from etid.results.tried_orders import Order
+from etid.results.driver import Order
 
 DEFAULT = "default"
 OURS = (DEFAULT, *names())

@@ -30,8 +30,7 @@ from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import WELL
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.batches import each
-from etid.identify.one import known_of
+from etid.identify.fitting import each, known_of
 from etid.recordings.preflight import Inspected
 from etid.signals.filtering import lfilter
 from etid.simulation.published import REFERENCE, TYPICAL

@@ -21,9 +21,9 @@ from etid.circuits.circuit import (
     SkinLayers,
     SkinRC,
 )
-from etid.identify import batches
 from etid.identify.arguments import fed
 from etid.identify.options import Options
+from etid.identify.study import choices as choices_of
 from etid.results.fit import Fit
 from etid.selection.search import usual_circuits
 from etid.selection.selection import Selection
@@ -96,7 +96,7 @@ def scene(snr_db: float, driver: int) -> Scene:
 
 def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Selection]:
     """What etid chooses for each recording alone, as `select_circuit` does, in batches."""
-    found, _ = batches.choices(
+    found, _ = choices_of(
         len(records),
         lambda row: fed(records[row], driver),
         Options(usual_circuits()),

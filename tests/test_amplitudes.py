@@ -20,7 +20,7 @@ from etid.estimators.amplitudes.terms import Amplitudes
 from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.amplitudes import leaves_much
-from etid.identify.one import known_of
+from etid.identify.fitting import known_of
 from etid.numpy_tier import tiers
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark

@@ -8,7 +8,7 @@ import pytest
 
 import etid
 from benchmarks.specimens import study_fits
-from etid.identify import arguments, options
+from etid.identify import arguments
 
 # The tests' own type checker would come first; a process of its own has none.
 CALLS = """
@@ -105,7 +105,7 @@ def test_a_class_in_place_of_its_instance_is_told_apart():
 
 
 def test_an_order_of_numpy_is_an_order():
-    assert options.order_of(np.int64(5)) == 5
+    assert arguments.order_of(np.int64(5)) == 5
 
 
 @pytest.mark.parametrize("value", ["5 mA", None, [1.0, 2.0], 1j])

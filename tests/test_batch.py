@@ -11,8 +11,8 @@ import pytest
 import etid
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.registry import OUTPUT_ERROR
-from etid.identify import batches, planning
-from etid.identify.one import skin_lane
+from etid.identify import fitting, planning
+from etid.identify.fitting import skin_lane
 from etid.identify.options import Options
 from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
@@ -42,7 +42,7 @@ def simulate(count=1, calibrations=1, seed=0, samples=LENGTH, **options):
 @pytest.fixture(scope="module", autouse=True)
 def several_calls():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batches, "LANES", FEW)
+        patch.setattr(fitting, "LANES", FEW)
         yield
 
 
@@ -88,7 +88,7 @@ def test_many_short_recordings_are_read_at_once_and_few_long_ones(
         monkeypatch.setattr(planning, name, value)
     rows = iter(range(MANY))
     found = [
-        list(planning.planned(lambda row: (records[row], driver), rows, Options()))
+        planning.prepared(lambda row: (records[row], driver), rows, Options())
         for _ in planning.calls(MANY)
     ]
     assert [len(part) for part in found if part] == taken
@@ -160,7 +160,7 @@ def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
         traced.append(arguments)
         return skin_lane(*arguments)
 
-    monkeypatch.setattr(batches, "skin_lane", counted)
+    monkeypatch.setattr(fitting, "skin_lane", counted)
     records = [
         cut(record, size)
         for record, size in zip(study.loaded.recordings(), range(2900, PULSE, 13), strict=False)
@@ -196,7 +196,7 @@ def test_one_function_per_length_serves_all_drivers(study, driver, monkeypatch):
     other = etid.identify_driver(simulate(seed=5)["calibration/0"])
     records = [study[path] for path in list(study.loaded)[:9]]
     etid.identify_skins(records, driver)
-    monkeypatch.setattr(batches, "skin_lane", None)  # of which another trace would have need
+    monkeypatch.setattr(fitting, "skin_lane", None)  # of which another trace would have need
     typical = etid.SkinRC(10e3, 50e3, 1e-9)
     fits = etid.identify_skins(records[:7], other, circuit=typical)
     assert fits.counts() == {"successful": 7}

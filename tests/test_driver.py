@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
 from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
+from etid.circuits.impedance import realise
 from etid.estimators.refined_driver import is_split
-from etid.results.driver import SourceImpedance, loaded, realise
+from etid.results.feed import SourceImpedance, loaded
 from etid.signals.transfer import frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)

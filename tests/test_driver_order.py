@@ -12,8 +12,7 @@ from benchmarks import driver_order as benchmark
 from benchmarks.ladder import CALIBRATION, rung
 from etid.commands import fit as command
 from etid.estimators.starts import source_starts
-from etid.results.driver import ContinuousDriver
-from etid.results.tried_orders import LARGEST, LEAST
+from etid.results.driver import LARGEST, LEAST, ContinuousDriver
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 
 TERMS = 3000

@@ -9,7 +9,7 @@ import scipy.linalg
 import scipy.signal
 
 from etid.circuits.circuit import Resistor, SkinRC
-from etid.results.driver import loaded
+from etid.results.feed import loaded
 from etid.signals import filtering
 from etid.signals.filtering import BLOCK, CUTOFF, TAPS, StateSpace, band_limited, hold, simulate
 from tests.test_driver import SOURCE

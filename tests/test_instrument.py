@@ -14,8 +14,8 @@ from etid.circuits.elements import capacitor, resistor
 from etid.circuits.impedance import parallel, series
 from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import given
-from etid.results.budget import EXAMPLES
 from etid.results.driver import ContinuousDriver, HarmonicDriver
+from etid.results.instrument import TOLERANCES
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
@@ -81,9 +81,9 @@ def test_an_error_far_beyond_its_tolerance_is_inconsistent():
     assert fitted(*records(gain=-2e-3), etid.Instrument(gain=2e-3)).verdict == "successful"
 
 
-@pytest.mark.parametrize("source", EXAMPLES)
+@pytest.mark.parametrize("source", TOLERANCES)
 def test_a_budget_says_what_an_error_that_nobody_stated_does(source):
-    size = EXAMPLES[source]
+    size = TOLERANCES[source][1]
     errors: dict[str, Any] = {source: size}
     right, wrong = fitted(*records()), fitted(*records(**errors))
     before, after = (np.log(np.asarray(fit.circuit.values())) for fit in (right, wrong))
@@ -99,7 +99,7 @@ def test_the_parts_of_a_budget_are_the_variances_of_the_fit():
     values = np.asarray(fit.circuit.values())
     relative = np.sqrt(np.diagonal(np.asarray(fit.cov))) / values
     np.testing.assert_allclose(budget.together, relative, rtol=1e-6)
-    assert {"recording", "driver", *EXAMPLES} == set(budget.parts)
+    assert {"recording", "driver", *TOLERANCES} == set(budget.parts)
     # Of a known resistor nothing is seen: its tolerance passes 1:1.
     np.testing.assert_allclose(budget.parts["r_load"], 2e-3, rtol=0.05)
     text = str(budget)
@@ -167,7 +167,7 @@ def recorded():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("skin", [DRY, DAMP], ids=["dry", "damp"])
-@pytest.mark.parametrize("source", [*EXAMPLES, "all"])
+@pytest.mark.parametrize("source", [*TOLERANCES, "all"])
 def test_intervals_hold_errors_that_are_drawn_from_their_tolerances(source, skin):
     told = {name: size for name, size in ALL.stored().items() if source in (name, "all")}
     instrument, inside, refused = etid.Instrument(**told), 0, 0

@@ -19,8 +19,8 @@ from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify import batches, one
-from etid.identify.one import known_at, known_of, skin_lane
+from etid.identify import fitting
+from etid.identify.fitting import known_at, known_of, skin_lane
 from etid.identify.options import Options, plan
 from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import Spectrum
@@ -35,7 +35,7 @@ DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 SAMPLES = 10_000
 SHORT = 3332  # less than a period; filled up like those of a period, which other tests fit
 SIGMAS = 5.0  # one in 2 million for a normal error
-FILES = 16  # that a reader of `identify_skin` opens at most; the last one tells the fit its data
+FILES = 17  # that a reader of `identify_skin` opens at most; the last one tells the fit its data
 
 
 def simulate(trials=1, resistors=(98.8e3,), samples=SAMPLES, seed=0, **options):
@@ -100,14 +100,16 @@ def test_a_fit_passes_through_few_files(study, driver):
     # Who runs the traced program, and how, is no part of the fit; compiled, it would run outside.
     runs = folder / "numpy_tier", folder / "garbage.py", folder / "precision.py"
     found = {path for path in found if not any(map(path.is_relative_to, runs))}
-    assert folder / "identify" / "one.py" in found
+    assert folder / "identify" / "fitting.py" in found
     names = " ".join(sorted(path.relative_to(folder).as_posix() for path in found))
     assert len(found) <= FILES, names
 
 
 def test_what_is_known_of_a_driver_is_kept(study, driver, monkeypatch):
     computed = []
-    monkeypatch.setattr(one, "known_at", lambda *of: computed.append(known_at(*of)) or computed[-1])
+    monkeypatch.setattr(
+        fitting, "known_at", lambda *of: computed.append(known_at(*of)) or computed[-1]
+    )
     other = dataclasses.replace(driver, steps=driver.steps)
     first, second = (etid.identify_skin(study["loaded/0"], other) for _ in range(2))
     assert len(computed) == 1
@@ -272,7 +274,7 @@ def test_a_study_of_ragged_lengths_compiles_once(study, driver, monkeypatch):
         traced.append(arguments)
         return skin_lane(*arguments)
 
-    monkeypatch.setattr(batches, "skin_lane", counted)
+    monkeypatch.setattr(fitting, "skin_lane", counted)
     records = [
         record.replace(v_th=record.v_th[:size], v_out=record.v_out[:size])
         for record in study.loaded.recordings()

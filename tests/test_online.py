@@ -18,7 +18,7 @@ from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.estimators.starts import harmonic_starts
-from etid.identify.one import known_at
+from etid.identify.fitting import known_at
 from etid.online import alarms, gain_bands, tick
 from etid.online.tracker import Tracker
 from etid.recordings.preflight import Inspected

@@ -1,7 +1,6 @@
 """Options of a fit: the same at every public function, checked at the call, kept in files."""
 
 import dataclasses
-import re
 from typing import Any
 
 import h5py
@@ -10,12 +9,10 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks.specimens import study_fits
 from etid import cli
 from etid.identify import file as files
 from etid.identify.options import Options
-from etid.results.provenance import PLAUSIBLE
-from etid.results.study_fits import StudyFits
+from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -31,32 +28,6 @@ ON_COMMAND_LINE = (
     *("--order", "4", "--circuit", STRING, "--plausible", "0:inf"),
     *("--fix", "r_0=33.4", "--prior", "c_1=1.2e-7,2e-8", "--bound", "r_1=100:"),
 )
-REFUSED: dict[str, str] = {
-    "etid.identify_driver(calibration, order=1)": "order: is 1, must be a whole number from 2 to",
-    "etid.identify_study(study, order=1)": "order: is 1, must be",
-    "etid.identify_jointly(study, order=21)": "order: is 21, must be",
-    "etid.fit_file('absent.h5', 'fits.h5', order=1)": "order: is 1, must be",
-    "etid.identify_study(study, order='auto', method='output_error')": "needs maximum likelihood",
-    "etid.identify_driver(calibration, plausible=(3e5, 3e2))": "plausible: is (300000.0, 300.0),",
-    "etid.identify_study(study, plausible=(-1.0, 3e2))": "plausible: is (-1.0, 300.0), must be",
-    "etid.identify_jointly(study, plausible=(1.0, np.nan))": "plausible: is (1.0, nan), must be",
-    "etid.fit_file('absent.h5', 'fits.h5', plausible=(1.0, 1.0))": "plausible: is (1.0, 1.0), must",
-    "etid.identify_study(study, driver_drift=-0.1)": "driver_drift is -0.1; it must be at least 0",
-    "etid.fit_file('absent.h5', 'fits.h5', driver_drift=1.0)": "driver_drift is 1.0; it must be",
-    "etid.identify_study(study, method='equation_error', driver_drift=0.1)": "gives none",
-    "etid.identify_jointly(study, r_load_tolerance=-0.1)": "r_load_tolerance is -0.1; it must be",
-    "etid.identify_jointly(study, r_load_tolerance=np.nan)": "r_load_tolerance is nan; it must be",
-    "etid.identify_study(study, method='guess')": "method 'guess' is not known",
-    "etid.identify_study(study, method='equation_error', fixed={'r_s': 1.0})": "no known elements",
-    "etid.identify_study(study, fixed={'r_9': 1.0})": "'r_9' is no element of SkinRC",
-    "etid.identify_study(study, bounds={'r_s': (2.0, 1.0)})": "the bounds of r_s are 2 and 1",
-    "etid.identify_study(study, circuit='R0-p(R1')": "'R0-p(R1' is no circuit: cannot read",
-    "etid.identify_skin(recording, circuit='R0-R0')": "has R0 twice",
-    "etid.identify_skins([recording], circuit='SkinRC')": "circuit: is str 'SkinRC', must be",
-    "etid.identify_impedance([1.0], [1j], circuit='auto')": "circuit: is str 'auto', must be",
-    "etid.identify_samples(*records, driver, **rates, circuit='R0-')": "'R0-' is no circuit",
-    "etid.select_circuit(recording, candidates=['R0', 'R1'])": "holds R0 and R1, which have the",
-}
 
 
 @pytest.fixture(scope="module")
@@ -90,20 +61,6 @@ def stored(path):
     settings = StudyFits.read(path).settings
     assert settings is not None
     return settings
-
-
-@pytest.mark.parametrize("call", REFUSED)
-def test_options_that_cannot_be_are_refused_at_the_call(study, call):
-    names = {
-        "records": (jnp.ones(1000), jnp.ones(1000)),
-        "rates": {"sample_rate": 2e5, "pulse_rate": 60.0},
-        "driver": study_fits().drivers["calibration/0",],
-        "study": study,
-        "calibration": study["calibration"],
-        "recording": study["loaded/0"],
-    }
-    with pytest.raises(ValueError, match=re.escape(REFUSED[call])):
-        eval(call, {"etid": etid, "np": np, **names})
 
 
 def test_all_functions_of_skin_take_the_same_options(study):

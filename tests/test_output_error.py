@@ -28,7 +28,7 @@ from etid.estimators.output_error.prediction import (
 )
 from etid.estimators.registry import OUTPUT_ERROR
 from etid.estimators.sandwich import Curvature
-from etid.identify.one import skin
+from etid.identify.fitting import skin
 from etid.recordings.preflight import Inspected
 from etid.results.driver import SourceImpedance
 from etid.signals.noise import Measurement

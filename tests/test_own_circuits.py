@@ -10,7 +10,7 @@ import pytest
 import etid
 from benchmarks.ladder import CALIBRATION, rung
 from etid.circuits.elements import Exponent, Ohm, PseudoCapacitance
-from etid.identify.steady_state import periodic_voltage
+from etid.identify.predict import periodic_voltage
 from etid.results.verdicts import verdict
 from etid.simulation.scenes import Trial
 

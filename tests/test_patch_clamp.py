@@ -16,7 +16,7 @@ import scipy.signal
 
 import etid
 from etid.circuits.circuit import SkinRC
-from etid.results.driver import realise
+from etid.circuits.impedance import realise
 from etid.signals.filtering import StateSpace, hold, simulate
 from etid.signals.transfer import Rational, multiply_polynomials
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt

@@ -5,9 +5,9 @@ import threading
 import pytest
 
 import etid
-from etid.identify import study_drivers
-from etid.identify.batches import prefetch
+from etid.identify import study as of_study
 from etid.identify.options import Options
+from etid.identify.planning import prefetch
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -85,8 +85,8 @@ def test_a_driver_is_identified_once_by_threads_that_ask_together(monkeypatch):
             together.wait(0.2)  # the other must not come here
         raise etid.IdentificationError("no driver", None)
 
-    monkeypatch.setattr(study_drivers, "calibrated", slow)
-    drivers = study_drivers.Drivers(study, Options())
+    monkeypatch.setattr(of_study, "calibrated", slow)
+    drivers = of_study.Drivers(study, Options())
     refused = []
 
     def ask():

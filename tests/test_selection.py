@@ -12,11 +12,9 @@ from benchmarks.selection_draws import choices
 from etid.circuits.elements import Farad, Ohm, PseudoCapacitance
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.starts import circuit_starts
-from etid.identify.one import note
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
 from etid.results.fit import CHANGES, Fit, Support
-from etid.results.residuals import looks_like
 from etid.results.verdicts import verdict
 from etid.selection.common import common, deserves
 from etid.selection.evidence import best, bic, rank, weights, with_close
@@ -276,7 +274,8 @@ def test_a_recording_that_deserves_another_circuit_says_so():
     ],
 )
 def test_a_residual_looks_like_what_a_passive_circuit_can_make(z, words):
-    said = looks_like(np.array(z))
+    nothing = np.zeros(())
+    said = Support(nothing, nothing, np.array(z), nothing, np.zeros(3)).looks_like()
     assert words in said
     assert bool(said) == bool(words)
 
@@ -322,7 +321,7 @@ def test_an_inconsistent_fit_names_another_circuit_where_a_score_shows_one():
     asks = made(etid.SkinRC(), 1400.0, "inconsistent", (19.0, *[0.0] * 8))
     assert "spread of time constants that the circuit cannot make (19" in asks.other_circuit
     assert "Another circuit is the likelier cause: try circuit='auto'" in str(asks)
-    assert note(asks).startswith("The residual looks like")
+    assert asks.note.startswith("The residual looks like")
     # Too little, a gain, and a driver with 30 % more leakage inductance.
     fast = (-7.5, 0.0, 0.0, 0.0, 5.1, 6.9, 12.1, 13.2, -1.9)
     for z in ((4.0, *[0.0] * 8), (*[0.0] * 8, 9.0), fast):

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from etid.circuits import lookup
 from etid.circuits.circuit import AbstractCircuit
 from etid.identify.options import Circuit
-from etid.results.tried_orders import AUTO
+from etid.results.driver import AUTO
 
 
 def add_circuit(parser: argparse.ArgumentParser, purpose: str, *, automatic: bool = False) -> None:

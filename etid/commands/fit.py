@@ -15,17 +15,16 @@ from etid.circuits.display import DISPLAY, heading, several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.commands.circuits import add_circuit
 from etid.estimators import registry
+from etid.identify.arguments import order_of
 from etid.identify.file import fit_file, kept, processes
 from etid.identify.jointly import identify_jointly
-from etid.identify.options import order_of
 from etid.recordings import hdf5
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import HDF5, claimed
 from etid.report.html import Table
-from etid.results.instrument import LARGEST, Instrument
-from etid.results.provenance import PLAUSIBLE
-from etid.results.study_fits import StudyFits
-from etid.results.tried_orders import Order
+from etid.results.driver import Order
+from etid.results.instrument import TOLERANCES, Instrument
+from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.results.verdicts import message, own_part
 
 
@@ -133,7 +132,7 @@ def _order(text: str) -> Order:
 
 
 def _known(text: str) -> tuple[str, list[float]]:
-    """Name and numbers of a known element, from --fix or --prior."""
+    """Name and numbers of --fix, --prior or --tolerance."""
     name, _, numbers = text.partition("=")
     try:
         return name, [float(number) for number in numbers.split(",")]
@@ -143,27 +142,24 @@ def _known(text: str) -> tuple[str, list[float]]:
         ) from error
 
 
+def _ends(text: str, example: str) -> list[float | None]:
+    """Both ends of a range; None where there is none."""
+    try:
+        low, high = (float(end) if end else None for end in text.split(":"))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no range; write {example}") from error
+    return [low, high]
+
+
 def _bound(text: str) -> tuple[str, list[float | None]]:
-    """Name and both bounds of an element, from --bound; None where there is none."""
+    """Name and both bounds of an element, from --bound."""
     name, _, ends = text.partition("=")
-    try:
-        low, high = (float(end) if end else None for end in ends.split(":"))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no bound of an element; write --bound r_s=100:2000 or r_s=100:"
-        ) from error
-    return name, [low, high]
+    return name, _ends(ends, "--bound r_s=100:2000 or r_s=100:")
 
 
-def _plausible(text: str) -> tuple[float, float]:
+def _plausible(text: str) -> list[float | None]:
     """The value of --plausible; the function that gets it checks the range."""
-    try:
-        low, high = map(float, text.split(":"))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no range of impedances; write --plausible 300:300e3"
-        ) from error
-    return low, high
+    return _ends(text, "--plausible 300:300e3")
 
 
 def _several(option: str, known: list[tuple[str, list[Any]]], count: int) -> dict[str, Any]:
@@ -181,8 +177,8 @@ def _several(option: str, known: list[tuple[str, list[Any]]], count: int) -> dic
 def _instrument(told: list[tuple[str, list[Any]]]) -> Instrument | None:
     """The tolerances of --tolerance."""
     for name, _ in told:
-        if name not in LARGEST:
-            raise ValueError(f"--tolerance knows no {name!r}; write {', '.join(LARGEST)}")
+        if name not in TOLERANCES:
+            raise ValueError(f"--tolerance knows no {name!r}; write {', '.join(TOLERANCES)}")
     return Instrument(**_several("--tolerance", told, 1)) if told else None
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import Known, require_element
-from etid.results.limited import Limited
+from etid.results.fit import Limited
 
 Limits = tuple[tuple[str, float, float], ...]
 """Elements with bounds: name, lower and upper bound [SI]; infinity without an upper bound."""

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import operator
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -22,15 +22,16 @@ from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
-from etid.identify.arguments import check_distinct, circuit_of, driver_of, fed
+from etid.identify.arguments import check_alike, check_distinct, circuit_of, driver_of, fed
 from etid.identify.arguments import recordings as list_of
-from etid.identify.one import known_of, remarks_on, successful
+from etid.identify.fitting import known_of, remarks_on
 from etid.identify.options import Interval, Options, plan
 from etid.identify.planning import failed_fit
+from etid.identify.skins import successful
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
-from etid.recordings.recording import Recording, RecordingError
+from etid.recordings.recording import Recording
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MEASURED_CURRENT, MeasuredCurrent
 from etid.results.fit import Fit
@@ -133,7 +134,8 @@ def identify_amplitudes(
         if driver is None
         else serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
     )
-    of = _alike(list_of("recordings", recordings))
+    of = list_of("recordings", recordings)
+    check_alike("recordings", of)
     fed_by = [fed(one, driver)[0] for one in of]
     check_distinct("recordings", of)
     seen = [Inspected(one) for one in fed_by]
@@ -150,32 +152,3 @@ def identify_amplitudes(
     )
     fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | of_records))
     return successful(seen[0].recording, fit) if throw else fit
-
-
-def _alike(of: Sequence[Recording]) -> Sequence[Recording]:
-    """The recordings.
-
-    Raises:
-        RecordingError: There is none, or they have different lengths or rates.
-    """
-    if not of:
-        raise RecordingError(
-            "is empty", field="recordings", remedy="Pass the recordings of one load in a list"
-        )
-    first = of[0]
-    for number, one in enumerate(of):
-        for field in ("sample_rate", "pulse_rate"):
-            if getattr(one, field) != getattr(first, field):
-                raise RecordingError(
-                    f"has {field} {getattr(one, field):g} Hz, the first {getattr(first, field):g}",
-                    field=f"recordings[{number}]",
-                    remedy="Record all amplitudes with the same settings",
-                )
-        sizes = [of.samples["v_out"].stored.size for of in (one, first)]
-        if sizes[0] != sizes[1]:
-            raise RecordingError(
-                f"has {sizes[0]} samples, the first {sizes[1]}",
-                field=f"recordings[{number}]",
-                remedy="Cut all recordings to the same number of samples",
-            )
-    return of

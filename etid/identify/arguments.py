@@ -1,17 +1,29 @@
 """Checks of recordings, drivers, circuits and numbers that a caller passes."""
 
 import hashlib
+import math
+import operator
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.lookup import circuit, is_circuit_string
+from etid.estimators.element_limits import Limits
+from etid.estimators.element_prior import Known
 from etid.recordings.errors import not_recorded
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
-from etid.results.driver import Driver
+from etid.results.driver import AUTO, Driver, Order
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
+from etid.results.study_fits import PLAUSIBLE
+
+# Four times the order of the paper. Calibrations determine no more poles; with 50 poles an
+# identification takes minutes and does not converge.
+LARGEST_ORDER = 20
+
+Interval = tuple[float | None, float | None]
+"""Lower and upper bound of an element [SI]; None if there is none."""
 
 _REMEDIES: dict[type, str] = {
     Recording: "Take one from a study, as in study['s01/dry/0'], or make one with etid.Recording",
@@ -77,6 +89,29 @@ def check_distinct(field: str, recordings: Sequence[Recording]) -> None:
         check_new(f"{field}[{number}]", one, first)
 
 
+def check_alike(field: str, recordings: Sequence[Recording]) -> None:
+    """Refuse recordings of different lengths or rates.
+
+    Raises:
+        RecordingError: There is none, or one differs from the first.
+    """
+    if not recordings:
+        raise RecordingError("is empty", field=field, remedy="Pass the recordings in a list")
+
+    def of(one: Recording) -> str:
+        size = one.samples["v_out"].stored.size
+        return f"{size} samples, sample_rate {one.sample_rate} Hz, pulse_rate {one.pulse_rate} Hz"
+
+    for number, one in enumerate(recordings):
+        if of(one) != of(recordings[0]):
+            raise RecordingError(
+                f"has {of(one)}; the first has {of(recordings[0])}",
+                path=one.path,
+                field=f"{field}[{number}]",
+                remedy="Record all with the same settings, or cut them to one length",
+            )
+
+
 def check_new(field: str, recording: Recording, first: dict[bytes, str]) -> None:
     """Refuse a recording with the samples of an earlier one; `check_distinct` for a stream.
 
@@ -130,6 +165,104 @@ def number_of(field: str, value: Any) -> float:
     raise RecordingError(
         f"is {reprlib.repr(value)}, must be a number", field=field, remedy="Give one number [SI]"
     )
+
+
+def order_of(value: Any) -> Order:
+    """The number of poles of a driver, or `"auto"`.
+
+    Raises:
+        RecordingError: The value is neither a whole number from 2 to `LARGEST_ORDER` nor `"auto"`.
+    """
+    try:
+        order = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        order = None
+    if isinstance(value, str) and value == AUTO:
+        return AUTO
+    if order is not None and 2 <= order <= LARGEST_ORDER:
+        return order
+    raise RecordingError(
+        f"is {reprlib.repr(value)}, must be a whole number from 2 to {LARGEST_ORDER}, or 'auto'",
+        field="order",
+        remedy='Pass a number of poles, as in order=5, or order="auto"',
+    )
+
+
+def part_of(field: str, value: Any) -> float:
+    """A relative standard deviation."""
+    if not 0 <= (part := number_of(field, value)) < 1:
+        raise ValueError(f"{field} is {value}; it must be at least 0 and below 1")
+    return part
+
+
+def range_of(field: str, value: Any) -> tuple[float, float]:
+    """A range of impedances [Ω].
+
+    Raises:
+        RecordingError: It is no pair of numbers, or it is empty.
+    """
+    try:
+        low, high = map(float, value)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if 0 <= low < high:
+        return low, high
+    raise RecordingError(
+        f"is {reprlib.repr(value)}, must be the lowest and the highest impedance [ohm]",
+        field=field,
+        remedy=f"Pass a pair, as in {field}={PLAUSIBLE}",
+    )
+
+
+def known_elements(
+    fixed: Mapping[str, float] | None, prior: Mapping[str, tuple[float, float]] | None
+) -> Known:
+    """The elements that are known before a fit, from the arguments of a caller.
+
+    Raises:
+        RecordingError: An argument is no mapping, an element is both fixed and has a prior, or a
+            value is no number.
+    """
+    for field, value in (("fixed", fixed), ("prior", prior)):
+        if not isinstance(value, Mapping | None):
+            raise RecordingError(
+                f"is {reprlib.repr(value)}, must name the elements",
+                field=field,
+                remedy='Pass fixed={"r_s": 500.0} or prior={"r_s": (500.0, 50.0)}',
+            )
+    fixed, prior = dict(fixed or {}), dict(prior or {})
+    for name in fixed.keys() & prior.keys():
+        raise RecordingError(f"{name} is fixed and has a prior", field="prior", remedy="Remove one")
+    try:
+        known = [(str(name), float(value), 0.0) for name, value in fixed.items()]
+        known += [(str(name), float(mean), float(std)) for name, (mean, std) in prior.items()]
+    except (TypeError, ValueError):
+        raise RecordingError(
+            "must be numbers [SI]",
+            field="prior" if prior else "fixed",
+            remedy='Pass fixed={"r_s": 500.0} or prior={"r_s": (500.0, 50.0)}',
+        ) from None
+    return tuple(known)
+
+
+def bounds_of(bounds: Mapping[str, Interval] | None) -> Limits:
+    """The bounds of elements, from the argument of a caller. Elements are positive.
+
+    Raises:
+        RecordingError: A bound is no number.
+    """
+    try:
+        ends = [(str(name), low, high) for name, (low, high) in dict(bounds or {}).items()]
+        return tuple(
+            (name, float(low or 0.0), math.inf if high is None else float(high))
+            for name, low, high in ends
+        )
+    except (TypeError, ValueError):
+        raise RecordingError(
+            "must be pairs of numbers [SI] or None",
+            field="bounds",
+            remedy='Pass bounds={"r_s": (100.0, 2e3)}, or (100.0, None) without an upper bound',
+        ) from None
 
 
 def driver_of(value: Driver | None) -> Driver | None:

@@ -14,8 +14,8 @@ from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
 from etid.estimators.registry import Method
 from etid.estimators.score_tests import of_calibrations
 from etid.identify import changes
-from etid.identify.arguments import check_distinct, recordings
-from etid.identify.one import checksum, needs_another, of_both
+from etid.identify.arguments import check_alike, check_distinct, recordings
+from etid.identify.fitting import better_of, checksum, may_hum
 from etid.identify.options import Options, check_instrument, check_order, for_calibrations
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
@@ -23,11 +23,10 @@ from etid.precision import in_float64
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
-from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
+from etid.results.driver import AUTO, ContinuousDriver, Driver, HarmonicDriver, Order
 from etid.results.fit import IdentificationError
 from etid.results.instrument import Instrument
-from etid.results.provenance import PLAUSIBLE
-from etid.results.tried_orders import AUTO, Order
+from etid.results.study_fits import PLAUSIBLE
 from etid.results.verdicts import message, verdict
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 from etid.signals import mains
@@ -103,12 +102,7 @@ def calibrated(
                 "The calibrations of a study are study.calibrations"
             )
         resistances.append(record.r_load)
-    sizes = {(record.v_th.size, record.sample_rate, record.pulse_rate) for record in records}
-    if len(sizes) > 1:
-        raise ValueError(
-            f"calibrations differ in (samples, sample rate, pulse rate): {sorted(sizes)}; "
-            "cut them to one length"
-        )
+    check_alike("calibrations", records)
     check_distinct("calibrations", records)
     seen = [Inspected(record) for record in records]
     for one in seen:
@@ -201,25 +195,17 @@ def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator)
 def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
     """The driver from calibrations that passed the pre-flight, aligned by their lags."""
     r_load = jax.device_put(np.asarray([one.recording.r_load for one in seen]))
-    if not estimator.lane.periodic:
-        aligned = [AlignedSamples.of(one) for one in seen]
-        size = min(one.size for one in aligned)
-        cut = [
-            dataclasses.replace(one, v_th=one.v_th[:size], v_out=one.v_out[:size])
-            for one in aligned
-        ]
-        return _identified(stacked(cut), r_load, order, estimator)
-    lanes = [Harmonics.of(one) for one in seen]
+    kind = Harmonics if estimator.lane.periodic else AlignedSamples
+    lanes = [kind.of(one) for one in seen]
     size = min(one.size for one in lanes)  # counted pulse rates may differ by one harmonic
-    lanes = [jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes]
-    records = stacked(lanes)
+    records = stacked([jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes])
     driver = _identified(records, r_load, order, estimator)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
     # elsewhere.
-    if needs_another(driver) or driver.verdict != "successful":
+    if isinstance(records, Harmonics) and (may_hum(driver) or driver.verdict != "successful"):
         few = records.selected & ~mains.lines(records.frequency)
         records = dataclasses.replace(records, selected=few)
-        driver = of_both(driver, _identified(records, r_load, order, estimator))
+        driver = better_of(driver, _identified(records, r_load, order, estimator))
     return driver
 
 

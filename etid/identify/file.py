@@ -23,24 +23,22 @@ import pathlib
 import shutil
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 from tqdm import tqdm
 
 from etid.circuits.lookup import class_path
 from etid.estimators.registry import Method
-from etid.identify.many import common_first, identify_part, to_identify
 from etid.identify.options import Circuit, Interval, Options, candidates_of
-from etid.identify.study_drivers import Drivers
+from etid.identify.study import Drivers, common_first, identify_part
 from etid.precision import in_float64
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import claimed, replace_text
+from etid.results.driver import Order
 from etid.results.instrument import Instrument
-from etid.results.provenance import PLAUSIBLE
-from etid.results.study_fits import StudyFits
-from etid.results.tried_orders import Order
+from etid.results.study_fits import PLAUSIBLE, StudyFits
 
 PART = 256  # recordings, some seconds of work; a killed run loses at most one part
 
@@ -49,38 +47,20 @@ class ResumeError(ValueError):
     """A run was interrupted, or the parts of an earlier run do not belong to this run."""
 
 
-class _Opened(NamedTuple):
-    """A file in use.
-
-    Attributes:
-        drivers: The study of the file, and its drivers that were needed so far.
-        paths: Paths of the recordings to identify, in order.
-    """
-
-    drivers: Drivers
-    paths: list[str]
-
-
-def _open(source: str, options: Options) -> _Opened:
-    study = read(source)
-    return _Opened(Drivers(study, options), to_identify(study))
-
-
 @functools.cache
-def _kept_open(source: str, stamp: int, options: Options) -> _Opened:
-    """`_open`, kept for the lifetime of the process: a worker gets its parts one by one."""
+def _kept_open(source: str, stamp: int, options: Options) -> Drivers:
+    """A file in use, for the lifetime of the process: a worker gets its parts one by one."""
     del stamp
-    return _open(source, options)
+    return Drivers(read(source), options)
 
 
-def _fit(opened: _Opened, options: Options, size: int, number: int) -> StudyFits:
+def _fit(drivers: Drivers, options: Options, size: int, number: int) -> StudyFits:
     """The fits of one part, with the drivers of this part only.
 
     This process may have identified the drivers of other parts before.
     """
-    drivers, paths = opened
-    part = paths[number * size : (number + 1) * size]
-    fits = identify_part(drivers, part, options, len(paths))
+    part = drivers.paths[number * size : (number + 1) * size]
+    fits = identify_part(drivers, part, options, len(drivers.paths))
     used = set()
     for path in part:
         with contextlib.suppress(RecordingError):
@@ -220,15 +200,13 @@ def fit_file(
         plausible=plausible,
     )
     source, target = os.path.abspath(source), pathlib.Path(target)
-    opened = _open(source, options)
-    study = opened.drivers.study
+    study = read(source)
+    drivers = Drivers(study, options)
     with study, claimed(target):
-        count = len(opened.paths)
-        if not count:
-            raise ValueError("the study has no loaded recording")
+        count = len(drivers.paths)
         numbers = range((count + PART - 1) // PART)
         stamp = os.stat(source).st_mtime_ns
-        options = common_first(opened.drivers, opened.paths, options)
+        options = common_first(drivers, options)
         settings = options.settings(study, count)
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
@@ -243,22 +221,22 @@ def fit_file(
         }
         parts = _Parts(target, run, resume)
         left = [number for number in numbers if not parts.path(number).exists()]
-        task = functools.partial(_fit, opened, options, PART)
+        task = functools.partial(_fit, drivers, options, PART)
         if executor is not None:
             task = functools.partial(_fit_elsewhere, source, stamp, options, PART)
-        drivers = {}
+        identified = {}
         done = min(count, (len(numbers) - len(left)) * PART)
         with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:
             for number, found in _results(task, left, executor):
                 dataclasses.replace(found, settings=settings).write(parts.path(number))
-                drivers |= found.drivers
+                identified |= found.drivers
                 bar.update(len(found.fits))
         whole = StudyFits.concatenate(
             StudyFits.read(parts.path(number), type(options.circuit)) for number in numbers
         )
         whole.write(target)
         shutil.rmtree(parts.folder)
-        return dataclasses.replace(whole, drivers={**whole.drivers, **drivers})
+        return dataclasses.replace(whole, drivers={**whole.drivers, **identified})
 
 
 def _results(

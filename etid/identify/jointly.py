@@ -6,7 +6,6 @@ standard errors separate the own error of a trial from the error that all trials
 """
 
 import dataclasses
-import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from tqdm import tqdm
 from etid.estimators import judgement
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.estimator import AbstractEstimator, serving
+from etid.estimators.estimator import serving
 from etid.estimators.joint.errors import Delay, Found
 from etid.estimators.joint.fit import fit_alone, fit_together
 from etid.estimators.joint.terms import Joint, Loads
@@ -37,36 +36,33 @@ from etid.estimators.lanes import (
 from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
+from etid.estimators.registry import register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import shape_of
 from etid.identify.arguments import check_new, require
-from etid.identify.batches import LANES, each, filled
-from etid.identify.many import common_first, identify_part, table, to_identify
-from etid.identify.one import (
+from etid.identify.fitting import (
+    Batch,
+    Prepared,
     checksum,
     concluded,
-    is_shared,
+    each,
+    filled,
     notes_of,
+    refitted,
     remarks_on,
-    repeated,
 )
 from etid.identify.options import Circuit, Interval, Options, candidates_of
-from etid.identify.planning import Refusal, calls, failed_fit, planned
-from etid.identify.study_drivers import Drivers
+from etid.identify.planning import Refusal, batches, failed_fit
+from etid.identify.study import Drivers, common_first, fields_of, table
 from etid.numpy_tier.tiers import program, worth_compiling
 from etid.precision import in_float64
-from etid.recordings.preflight import Inspected
-from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.recordings.study import Study
-from etid.results.driver import HarmonicDriver
-from etid.results.feed import AbstractFeed, MeasuredCurrent
+from etid.results.driver import HarmonicDriver, Order
+from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
-from etid.results.provenance import PLAUSIBLE
-from etid.results.study_fits import StudyFits
-from etid.results.tried_orders import Order
+from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.results.verdicts import RESULTS, verdict, verdict_names, verdicts_of
 from etid.selection.delays import upper_limit
 
@@ -219,41 +215,36 @@ def _replaced(fits: Fit, others: Fit, where: Bool[np.ndarray, " lane"]) -> Fit:
     return jax.tree.map(one, fits, others)
 
 
-class _Waiting:
+def _key(one: Prepared) -> tuple[Any, ...]:
+    """Equal for recordings of one group: their harmonics are the same."""
+    return one.seen.v_th.size, *one.key
+
+
+class _Group:
     """Recordings of one driver with the same number of harmonics, fitted by one estimator."""
 
-    def __init__(
-        self, model: Joint, driver: HarmonicDriver, estimator: AbstractEstimator, total: int
-    ) -> None:
+    def __init__(self, options: Options, like: Prepared, total: int) -> None:
         self.total = total  # recordings of the study
-        self.model = model
-        self.driver = driver
-        self.estimator = estimator
+        self.estimator = like.estimator
+        self.driver = serving(like.driver, HarmonicDriver, str(like.estimator))
+        self.shared = like.shared
+        self.model = _model(options, self.driver, like.shared)
         self.rows: list[int] = []
-        self.seen: list[Inspected] = []  # the recordings that wait for their first fits
         self.starts: list[_Start] = []
         self.remarks: list[int] = []
         self.unloaded: list[int] = []
         self.repeats: list[Repeats | None] = []
 
-    def add(self, row: int, seen: Inspected) -> None:
-        self.rows.append(row)
-        self.unloaded.append(checksum(seen))
-        self.seen.append(seen)
-        if len(self.seen) == LANES:
-            self.run()
-
-    def run(self) -> None:
-        if not self.seen:
-            return
-        lanes = self.estimator.lane.of_several(self.seen)
-        starts = repeated(lanes, self.seen, self._alone, _late_by, _need_another, _of_both)
-        for start, seen in zip(starts, self.seen, strict=True):
+    def add(self, batch: Batch) -> None:
+        """Identify the loads of a batch one by one."""
+        starts = refitted(batch.lanes, batch.seen, self._alone, _late_by, _may_hum, _better)
+        for start, seen in zip(starts, batch.seen, strict=True):
             hum = Remark.mains_hum if start.hum else 0
             self.remarks.append(remarks_on(seen, self.estimator) | hum)
+        self.rows += batch.rows
         self.starts += starts
-        self.repeats += repeats(self.seen)
-        self.seen = []
+        self.unloaded += map(checksum, batch.seen)
+        self.repeats += repeats(batch.seen)
 
     def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
         fit = _ALONE[worth_compiling(self.total * lanes[0].size)]
@@ -271,7 +262,6 @@ class _Waiting:
         return [key for key, count in Counter(self.unloaded).items() if count > 1]
 
     def loads(self) -> Loads:
-        self.run()
         starts = [start.loads for start in self.starts]
         loads = jax.tree.map(lambda *parts: np.stack(parts), *starts)
         number = {key: i for i, key in enumerate(self.several())}
@@ -294,11 +284,11 @@ def _late_by(lanes: Sequence[AbstractLane], starts: Sequence[_Start]) -> dict[in
     return {row: by for row, by in late.items() if any(by)}
 
 
-def _need_another(starts: Sequence[_Start]) -> list[int]:
+def _may_hum(starts: Sequence[_Start]) -> list[int]:
     return [row for row, one in enumerate(starts) if one.hum or not one.loads.used]
 
 
-def _of_both(first: _Start, second: _Start) -> _Start:
+def _better(first: _Start, second: _Start) -> _Start:
     if second.loads.used and second.hum:
         return second._replace(changed=first.changed)
     return first._replace(hum=np.asarray(False))
@@ -360,95 +350,77 @@ def identify_jointly(
         plausible=plausible,
     )
     drivers = Drivers(study, options)
-    paths = to_identify(study)
-    if not paths:
-        raise ValueError("the study has no loaded recording")
-    options = common_first(drivers, paths, options)
+    paths = drivers.paths
+    options = common_first(drivers, options)
+    only = dataclasses.replace(options, circuits=(options.circuit,))
     fits: dict[int, Fit] = {}
     notes = [""] * len(paths)
-    waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
-
-    by_current: list[int] = []
+    groups: dict[tuple[str, ...], dict[Any, _Group]] = {}
     first: dict[bytes, str] = {}
-
-    def load(row: int) -> tuple[Recording, AbstractFeed]:
-        return drivers.fed(study[paths[row]])
-
-    rows = iter(range(len(paths)))
-    inspected = itertools.chain.from_iterable(
-        planned(load, rows, options) for _ in calls(len(paths))
-    )
-    for row, of in tqdm(inspected, "", len(paths), unit="recording", disable=not progress):
-        if not isinstance(of, Refusal) and not of.estimator.lane.periodic:
-            of = Refusal("not_periodic", SINGLE)
-        if isinstance(of, Refusal):
-            fits[row] = failed_fit(of.name, options, METHOD)
-            notes[row] = of.note
-            continue
-        seen, found, estimator = of
-        if isinstance(found, MeasuredCurrent):
-            by_current.append(row)
-            continue
-        check_new(f"study[{paths[row]!r}]", seen.recording, first)
-        driver = serving(found, HarmonicDriver, str(estimator))
-        lengths = waiting.setdefault(drivers.of(seen.recording), {})
-        shared = is_shared(seen, driver)
-        rates = seen.recording.sample_rate, seen.recording.pulse_rate
-        key = seen.v_th.size, shared, *rates, estimator
-        if key not in lengths:
-            model = _model(options, driver, shared)
-            lengths[key] = _Waiting(model, driver, estimator, len(paths))
-        lengths[key].add(row, seen)
-    for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
-        driver = next(iter(lengths.values())).driver
-        groups = [group.loads() for group in lengths.values()]
-        several = tuple(len(group.several()) for group in lengths.values())
-        shared = any(group.model.shared for group in lengths.values())
-        tolerance = jax.device_put(options.r_load_tolerance)
-        numbers = sum(of.spectrum.x.size for of in groups)
-        together = _TOGETHER[worth_compiling(numbers)]
-        model = _model(options, driver, shared)
-        found, better, delays, cov = together(model, groups, several, driver, tolerance)
-        found, delays, cov = jax.device_get((found, delays, cov))
-        width = _narrower(groups, found, delays, cov, float(driver.sample_rate))
-        if width is not None and better.verdict == "successful":
-            again = dataclasses.replace(Calibrations.of(better), delay_width=jax.device_put(width))
-            model = dataclasses.replace(model, calibrations=again)
-            others, better, *_ = together(model, groups, several, better, tolerance)
-            for number, (group, other) in enumerate(
-                zip(lengths.values(), jax.device_get(others), strict=True)
-            ):
-                both = _successful(found[number]) & _successful(other)
-                found[number] = _replaced(found[number], other, both)
-                group.remarks = [
-                    remarks | (Remark.small_delays if known else 0)
-                    for remarks, known in zip(group.remarks, both, strict=True)
-                ]
-        # A compiled function returns JAX arrays. The checksums must stay a numpy array.
-        better = dataclasses.replace(better, method=METHOD, unloaded=driver.unloaded)
-        changed = any(any(group.changed) for group in lengths.values())
-        if changed and not any(np.any(loads.used) for loads in groups):
-            better = dataclasses.replace(better, result=verdict("inconsistent"))
-        drivers.found[names] = better
-        for group, fit in zip(lengths.values(), found, strict=True):
-            alone = _alone_judged(fit, group.changed)
-            judged = concluded(alone, better, group.remarks, group.repeats)
+    for batch in batches(len(paths), drivers.loader(paths), only, progress, _key):
+        if isinstance(batch, Batch) and isinstance(batch.like.driver, MeasuredCurrent):
+            found = batch.fitted(only.circuits, len(paths)).only
+            alone = dataclasses.replace(found, method=METHOD)
+            for row, fit, text in zip(batch.rows, unstacked(alone), notes_of(alone), strict=True):
+                fits[row], notes[row] = fit, text
+        elif isinstance(batch, Batch) and batch.like.estimator.lane.periodic:
+            for row, seen in zip(batch.rows, batch.seen, strict=True):
+                check_new(f"study[{paths[row]!r}]", seen.recording, first)
+            lengths = groups.setdefault(drivers.of(batch.seen[0].recording), {})
+            key = _key(batch.like)
+            lengths[key] = lengths.get(key) or _Group(only, batch.like, len(paths))
+            lengths[key].add(batch)
+        else:
+            refusal = Refusal("not_periodic", SINGLE)
+            rows = batch.rows if isinstance(batch, Batch) else [batch[0]]
+            if not isinstance(batch, Batch) and batch[1].name != "not_periodic":
+                refusal = batch[1]
+            for row in rows:
+                fits[row], notes[row] = failed_fit(refusal.name, only, METHOD), refusal.note
+    for names, lengths in tqdm(groups.items(), unit="driver", disable=not progress):
+        together = list(lengths.values())
+        found, drivers.found[names] = _fit_together(only, together)
+        for group, judged in zip(together, found, strict=True):
             of_group = zip(group.rows, unstacked(judged), notes_of(judged), strict=True)
             for row, one, text in of_group:
                 fits[row], notes[row] = one, text
-    if by_current:
-        own = [paths[row] for row in by_current]
-        of_each = dataclasses.replace(
-            options, circuits=(options.circuit,), estimator=MAXIMUM_LIKELIHOOD
-        )
-        alone = identify_part(drivers, own, of_each, len(own))
-        as_joint = unstacked(dataclasses.replace(alone.fit, method=METHOD))
-        for row, fit, text in zip(by_current, as_joint, alone.notes, strict=True):
-            fits[row], notes[row] = fit, str(text)
     ordered = stacked([fits[row] for row in range(len(paths))])
-    outcome = table(study, paths, ordered, notes)
+    outcome = table([fields_of(study, path) for path in paths], ordered, notes)
     settings = options.settings(study, len(paths), METHOD)
     return StudyFits(outcome, drivers.found, drivers.failures, settings)
+
+
+def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit], HarmonicDriver]:
+    """The fits of all recordings of one driver, by group, and the driver."""
+    driver, loads = groups[0].driver, [group.loads() for group in groups]
+    several = tuple(len(group.several()) for group in groups)
+    model = _model(options, driver, any(group.shared for group in groups))
+    tolerance = jax.device_put(options.r_load_tolerance)
+    together = _TOGETHER[worth_compiling(sum(of.spectrum.x.size for of in loads))]
+    found, better, delays, cov = together(model, loads, several, driver, tolerance)
+    found, delays, cov = jax.device_get((found, delays, cov))
+    small = [np.zeros(len(group.rows), bool) for group in groups]
+    width = _narrower(loads, found, delays, cov, float(driver.sample_rate))
+    if width is not None and better.verdict == "successful":
+        again = dataclasses.replace(Calibrations.of(better), delay_width=jax.device_put(width))
+        model = dataclasses.replace(model, calibrations=again)
+        others, better, *_ = together(model, loads, several, better, tolerance)
+        others = jax.device_get(others)
+        small = [
+            _successful(one) & _successful(other) for one, other in zip(found, others, strict=True)
+        ]
+        found = [_replaced(*of_group) for of_group in zip(found, others, small, strict=True)]
+    # A compiled function returns JAX arrays. The checksums must stay a numpy array.
+    better = dataclasses.replace(better, method=METHOD, unloaded=driver.unloaded)
+    changed = any(any(group.changed) for group in groups)
+    if changed and not any(np.any(of.used) for of in loads):
+        better = dataclasses.replace(better, result=verdict("inconsistent"))
+    judged = []
+    for group, fit, narrow in zip(groups, found, small, strict=True):
+        remarks = np.where(narrow, np.array(group.remarks) | Remark.small_delays, group.remarks)
+        alone = _alone_judged(fit, group.changed)
+        judged.append(concluded(alone, better, remarks.tolist(), group.repeats))
+    return judged, better
 
 
 def _alone_judged(fits: Fit, changed: Sequence[bool]) -> Fit:

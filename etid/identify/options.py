@@ -3,11 +3,9 @@
 import dataclasses
 import functools
 import math
-import operator
 import os
-import reprlib
 from collections.abc import Mapping, Sequence
-from typing import Any, TypedDict
+from typing import TypedDict
 
 import equinox as eqx
 import jax
@@ -19,28 +17,35 @@ from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.output_error.estimator import OutputError
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT, Method, named
-from etid.identify.arguments import circuit_of, number_of, require
+from etid.estimators.registry import (
+    MAXIMUM_LIKELIHOOD,
+    OUTPUT_ERROR,
+    WITH_CURRENT,
+    Method,
+    named,
+)
+from etid.identify.arguments import (
+    Interval,
+    bounds_of,
+    circuit_of,
+    known_elements,
+    order_of,
+    part_of,
+    range_of,
+    require,
+)
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import RecordingError
 from etid.recordings.study import Study
-from etid.results.driver import ContinuousDriver, HarmonicDriver
+from etid.results.driver import AUTO, ContinuousDriver, HarmonicDriver, Order
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.instrument import Instrument
-from etid.results.provenance import PLAUSIBLE, Settings, versions
-from etid.results.tried_orders import AUTO, Order
+from etid.results.study_fits import PLAUSIBLE, Settings, versions
 from etid.selection.search import usual_circuits
-
-# Four times the order of the paper. Calibrations determine no more poles; with 50 poles an
-# identification takes minutes and does not converge.
-LARGEST_ORDER = 20
 
 Circuit = AbstractCircuit | str | None
 """A circuit or a circuit string; `"auto"` for the simplest circuit that the data support; None for
 `SkinRC`."""
-
-Interval = tuple[float | None, float | None]
-"""Lower and upper bound of an element [SI]; None if there is none."""
 
 
 class FitOptions(TypedDict, total=False):
@@ -113,13 +118,13 @@ class Options:
         options = cls(
             circuits=tuple(circuits),
             estimator=estimator,
-            known=_informed(fixed, prior),
-            bounds=_bounded(bounds),
+            known=known_elements(fixed, prior),
+            bounds=bounds_of(bounds),
             order=order_of(order),
-            driver_drift=_part("driver_drift", driver_drift),
+            driver_drift=part_of("driver_drift", driver_drift),
             instrument=instrument,
-            r_load_tolerance=_part("r_load_tolerance", r_load_tolerance),
-            plausible=_range("plausible", plausible),
+            r_load_tolerance=part_of("r_load_tolerance", r_load_tolerance),
+            plausible=range_of("plausible", plausible),
         )
         if estimator is not None:
             options.given_to(estimator)
@@ -331,101 +336,3 @@ def plan(
     if isinstance(driver, ContinuousDriver):
         check_instrument(driver.instrument, estimator)
     return options.given_to(estimator), name
-
-
-def order_of(value: Any) -> Order:
-    """The number of poles of a driver, or `"auto"`.
-
-    Raises:
-        RecordingError: The value is neither a whole number from 2 to `LARGEST_ORDER` nor `"auto"`.
-    """
-    try:
-        order = None if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        order = None
-    if isinstance(value, str) and value == AUTO:
-        return AUTO
-    if order is not None and 2 <= order <= LARGEST_ORDER:
-        return order
-    raise RecordingError(
-        f"is {reprlib.repr(value)}, must be a whole number from 2 to {LARGEST_ORDER}, or 'auto'",
-        field="order",
-        remedy='Pass a number of poles, as in order=5, or order="auto"',
-    )
-
-
-def _part(field: str, value: Any) -> float:
-    """A relative standard deviation."""
-    if not 0 <= (part := number_of(field, value)) < 1:
-        raise ValueError(f"{field} is {value}; it must be at least 0 and below 1")
-    return part
-
-
-def _range(field: str, value: Any) -> tuple[float, float]:
-    """A range of impedances [Ω].
-
-    Raises:
-        RecordingError: It is no pair of numbers, or it is empty.
-    """
-    try:
-        low, high = map(float, value)
-    except (TypeError, ValueError):
-        low = high = math.nan
-    if 0 <= low < high:
-        return low, high
-    raise RecordingError(
-        f"is {reprlib.repr(value)}, must be the lowest and the highest impedance [ohm]",
-        field=field,
-        remedy=f"Pass a pair, as in {field}={PLAUSIBLE}",
-    )
-
-
-def _informed(
-    fixed: Mapping[str, float] | None, prior: Mapping[str, tuple[float, float]] | None
-) -> Known:
-    """The elements that are known before a fit, from the arguments of a caller.
-
-    Raises:
-        RecordingError: An argument is no mapping, an element is both fixed and has a prior, or a
-            value is no number.
-    """
-    for field, value in (("fixed", fixed), ("prior", prior)):
-        if not isinstance(value, Mapping | None):
-            raise RecordingError(
-                f"is {reprlib.repr(value)}, must name the elements",
-                field=field,
-                remedy='Pass fixed={"r_s": 500.0} or prior={"r_s": (500.0, 50.0)}',
-            )
-    fixed, prior = dict(fixed or {}), dict(prior or {})
-    for name in fixed.keys() & prior.keys():
-        raise RecordingError(f"{name} is fixed and has a prior", field="prior", remedy="Remove one")
-    try:
-        known = [(str(name), float(value), 0.0) for name, value in fixed.items()]
-        known += [(str(name), float(mean), float(std)) for name, (mean, std) in prior.items()]
-    except (TypeError, ValueError):
-        raise RecordingError(
-            "must be numbers [SI]",
-            field="prior" if prior else "fixed",
-            remedy='Pass fixed={"r_s": 500.0} or prior={"r_s": (500.0, 50.0)}',
-        ) from None
-    return tuple(known)
-
-
-def _bounded(bounds: Mapping[str, Interval] | None) -> Limits:
-    """The bounds of elements, from the argument of a caller. Elements are positive.
-
-    Raises:
-        RecordingError: A bound is no number.
-    """
-    try:
-        ends = [(str(name), low, high) for name, (low, high) in dict(bounds or {}).items()]
-        return tuple(
-            (name, float(low or 0.0), math.inf if high is None else float(high))
-            for name, low, high in ends
-        )
-    except (TypeError, ValueError):
-        raise RecordingError(
-            "must be pairs of numbers [SI] or None",
-            field="bounds",
-            remedy='Pass bounds={"r_s": (100.0, 2e3)}, or (100.0, None) without an upper bound',
-        ) from None

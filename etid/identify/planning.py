@@ -1,17 +1,28 @@
-"""Reading and inspection of recordings: which can be fitted, and why the others cannot."""
+"""Reading and inspection of recordings: which can be fitted, and why the others cannot.
 
+During a fit, a thread reads the next recordings in chunks. A bad recording gets a verdict and a
+note; the other recordings are not affected.
+"""
+
+import collections
+import contextlib
 import itertools
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+import operator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
 from etid.estimators.element_limits import limited, of_circuit
-from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.lanes import AbstractLane
 from etid.identify import changes
-from etid.identify.options import Options, plan
+from etid.identify.fitting import FEWEST, Batch, Prepared, is_shared
+from etid.identify.options import Options, check_default, plan
+from etid.precision import in_float64
 from etid.recordings.causes import why_implausible, why_misaligned
 from etid.recordings.preflight import Group, Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
@@ -20,11 +31,168 @@ from etid.results.fit import Fit, IdentificationError, Support
 from etid.results.verdicts import message, verdict
 
 TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB
-FEWEST = 16  # recordings that are read at once, however long they are
 MOST = 64  # recordings that are read at once if they are short; many more save little time
+AHEAD = 2  # chunks that are read and inspected in advance
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 # Verdicts whose message says more of a recording.
 EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
+T = TypeVar("T")
+
+Load = Callable[[int], tuple[Recording, AbstractFeed]]
+"""Reads the recording of a row, and its driver. Its error becomes the verdict of this row."""
+
+
+class Refusal(NamedTuple):
+    """A recording that cannot be fitted: the name of its verdict and a note."""
+
+    name: str
+    note: str
+
+    @classmethod
+    def of(cls, error: Exception) -> "Refusal":
+        """The refusal of a recording that cannot be read, or whose driver failed."""
+        failed = isinstance(error, IdentificationError)
+        return cls("driver_failed" if failed else "unreadable", str(error))
+
+
+def prepared(
+    load: Load, rows: Iterator[int], options: Options
+) -> list[tuple[int, Prepared | Refusal]]:
+    """The next recordings, or the reasons why they cannot be fitted.
+
+    Recordings of equal length and rates are inspected together. At least `FEWEST` recordings are
+    taken from `rows`, and up to `MOST` as long as they have no more than `TOGETHER` samples.
+
+    Args:
+        load: Reads a recording and its driver.
+        rows: Numbers of the recordings; the order of the results may differ.
+        options: What the caller asks for.
+    """
+    found: list[tuple[int, Prepared | Refusal]] = []
+    loaded: dict[tuple[int, str, float, float], list[tuple[int, Recording, AbstractFeed]]] = {}
+    held = 0
+    for number, row in enumerate(itertools.islice(rows, MOST), 1):
+        try:
+            of, driver = load(row)
+        except ERRORS as error:
+            found.append((row, Refusal.of(error)))
+        else:
+            key = of.samples["v_out"].stored.size, of.cause, of.sample_rate, of.pulse_rate
+            loaded.setdefault(key, []).append((row, of, driver))
+            held += key[0]
+            if number >= FEWEST and held + key[0] > TOGETHER:
+                break
+    planned: dict[type[AbstractLane], list[tuple[int, tuple[Inspected, AbstractFeed, Any]]]] = {}
+    for row, seen, driver in _inspected(loaded.values()):
+        try:
+            estimator, name = plan(options, seen, driver)
+        except ERRORS as error:
+            found.append((row, Refusal.of(error)))
+            continue
+        refusal = None if name is None else Refusal(name, explained(seen, name))
+        if refusal is None:
+            try:
+                check_default(estimator, options.circuits)
+            except ValueError as error:
+                refusal = Refusal("not_periodic", str(error))
+        if refusal is None:
+            planned.setdefault(estimator.lane, []).append((row, (seen, driver, estimator)))
+        else:
+            found.append((row, refusal))
+    for kind, alike in planned.items():
+        lanes = kind.of_several([seen for _, (seen, *_) in alike])
+        for (row, (seen, driver, estimator)), lane in zip(alike, lanes, strict=True):
+            shared = is_shared(seen, driver)
+            found.append((row, Prepared(seen, driver, estimator, lane, shared)))
+    return found
+
+
+def calls(count: int) -> range:
+    """Numbers of the calls of `prepared` that take `count` recordings; the last may take none."""
+    return range(-(-count // FEWEST))
+
+
+def _inspected(
+    alike: Iterable[Sequence[tuple[int, Recording, AbstractFeed]]],
+) -> Iterator[tuple[int, Inspected, AbstractFeed]]:
+    """Recordings, each sequence of equal length and rates, with their properties."""
+    for several in alike:
+        together = max(1, TOGETHER // max(1, several[0][1].samples["v_out"].stored.size))
+        for first in range(0, len(several), together):
+            part = several[first : first + together]
+            group = Group([of for _, of, _ in part])
+            for number, (row, of, driver) in enumerate(part):
+                yield row, Inspected(of, group, number), driver
+
+
+def prefetch(
+    load: Callable[[int], T], count: int, ahead: int
+) -> Generator[Callable[[], T], None, None]:
+    """Call `load(0)`, `load(1)`, … in another thread, in this order and one at a time.
+
+    Close the iterator to stop early: the running call finishes, the others do not start.
+
+    Args:
+        load: A function that spends its time outside Python, in file access or numpy.
+        count: Number of calls.
+        ahead: Largest number of calls in advance of the caller.
+
+    Yields:
+        For each call a function that waits for the result and returns it, or raises its error.
+    """
+    with ThreadPoolExecutor(1, thread_name_prefix="prefetch") as thread:
+        waiting = collections.deque(thread.submit(load, row) for row in range(min(ahead, count)))
+        try:
+            for row in range(count):
+                loaded = waiting.popleft()
+                if row + ahead < count:
+                    waiting.append(thread.submit(load, row + ahead))
+                yield loaded.result
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def batches(
+    count: int,
+    load: Load,
+    options: Options,
+    progress: bool = False,
+    key: Callable[[Prepared], tuple[Any, ...]] = operator.attrgetter("key"),
+) -> Iterator[tuple[int, Refusal] | Batch]:
+    """All recordings in batches, and those that cannot be fitted.
+
+    Args:
+        count: Number of recordings.
+        load: Reads a recording and its driver.
+        options: What the caller asks for.
+        progress: Show a progress bar.
+        key: Equal for recordings of one batch.
+    """
+    waiting: dict[tuple[Any, ...], Batch] = {}
+    rows = iter(range(count))
+
+    @in_float64  # the setting belongs to a thread, and this runs in another one
+    def read(_: int) -> list[tuple[int, Prepared | Refusal]]:
+        return prepared(load, rows, options)
+
+    with (
+        tqdm(total=count, unit="fit", disable=not progress) as bar,
+        contextlib.closing(prefetch(read, len(calls(count)), AHEAD)) as chunks,
+    ):
+        for row, one in itertools.chain.from_iterable(chunk() for chunk in chunks):
+            if isinstance(one, Refusal):
+                yield row, one
+                bar.update()
+                continue
+            batch = waiting.setdefault(key(one), Batch(one))
+            batch.add(row, one)
+            if batch.full:
+                bar.update(len(batch.rows))
+                yield waiting.pop(key(one))
+        for batch in waiting.values():
+            bar.update(len(batch.rows))
+            yield batch
 
 
 def explained(seen: Inspected, name: str) -> str:
@@ -58,15 +226,13 @@ def failed_fit(name: str, options: Options, method: str) -> Fit:
     circuit = options.circuit
     size = len(circuit.names())
     nan = np.full((size, size), np.nan)
-    empty = circuit.with_log_values(jnp.full(size, jnp.nan))
-    scalar = np.asarray(np.nan)
     none = changes.unknown(size)
     fit = Fit(
-        circuit=empty,
+        circuit=circuit.with_log_values(jnp.full(size, jnp.nan)),
         cov=nan,
         shared_cov=nan,
-        rrse=scalar,
-        chi2=scalar,
+        rrse=np.asarray(np.nan),
+        chi2=np.asarray(np.nan),
         result=verdict(name),
         steps=np.asarray(0),
         method=method,
@@ -76,77 +242,3 @@ def failed_fit(name: str, options: Options, method: str) -> Fit:
         limits=limited(circuit, of_circuit(options.bounds, circuit)),
     )
     return jax.tree.map(np.asarray, fit)
-
-
-class Refusal:
-    """A recording that cannot be fitted: the name of its verdict and a note."""
-
-    def __init__(self, name: str, note: str = "") -> None:
-        self.name = name
-        self.note = note or message(name)
-
-
-class Planned(NamedTuple):
-    """A recording that can be fitted, with its driver and its estimator."""
-
-    seen: Inspected
-    driver: AbstractFeed
-    estimator: AbstractEstimator
-
-
-def planned(
-    load: Callable[[int], tuple[Recording, AbstractFeed]],
-    rows: Iterator[int],
-    options: Options,
-) -> Iterator[tuple[int, Planned | Refusal]]:
-    """Some recordings with their drivers and estimators, or the reason why they cannot be fitted.
-
-    Recordings of equal length and rates are inspected together. At least `FEWEST` recordings are
-    taken from `rows`, and up to `MOST` as long as they have no more than `TOGETHER` samples.
-
-    Args:
-        load: Reads a recording and its driver.
-        rows: Numbers of the recordings; the order of the results may differ.
-        options: What the caller asks for.
-    """
-    loaded: dict[tuple[int, str, float, float], list[tuple[int, Recording, AbstractFeed]]] = {}
-    held = 0
-    for number, row in enumerate(itertools.islice(rows, MOST), 1):
-        try:
-            of, driver = load(row)
-        except ERRORS as error:
-            yield row, _refusal(error)
-        else:
-            key = of.samples["v_out"].stored.size, of.cause, of.sample_rate, of.pulse_rate
-            loaded.setdefault(key, []).append((row, of, driver))
-            held += key[0]
-            if number >= FEWEST and held + key[0] > TOGETHER:
-                break
-    for (size, *_), alike in loaded.items():
-        together = max(1, TOGETHER // max(1, size))
-        for first in range(0, len(alike), together):
-            part = alike[first : first + together]
-            group = Group([of for _, of, _ in part])
-            for number, (row, of, driver) in enumerate(part):
-                yield row, _planned(Inspected(of, group, number), driver, options)
-
-
-def calls(count: int) -> range:
-    """Numbers of the calls of `planned` that take `count` recordings; the last may take none."""
-    return range(-(-count // FEWEST))
-
-
-def _planned(seen: Inspected, driver: AbstractFeed, options: Options) -> Planned | Refusal:
-    try:
-        estimator, name = plan(options, seen, driver)
-    except ERRORS as error:
-        return _refusal(error)
-    return (
-        Planned(seen, driver, estimator) if name is None else Refusal(name, explained(seen, name))
-    )
-
-
-def _refusal(error: Exception) -> Refusal:
-    return Refusal(
-        "driver_failed" if isinstance(error, IdentificationError) else "unreadable", str(error)
-    )

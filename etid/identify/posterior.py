@@ -33,6 +33,7 @@ from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_limits import Limits, of_circuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
+from etid.estimators.maximum_likelihood import load_fit
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
@@ -40,19 +41,21 @@ from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import minimum as least
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
-from etid.identify.one import is_shared, known_of, skin
+from etid.identify.fitting import is_shared, known_of, skin
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
-from etid.results.driver import Driver
+from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
+from etid.results.instrument import TOLERANCES, Budget, Instrument
 from etid.results.posterior import Posterior
 from etid.solvers.importance_sampling import drawn
 from etid.solvers.matrices import inverse
 
 AT_ONCE = 16  # draws in one vectorised evaluation
+NARROW = 1e-3  # of a tolerance that nobody stated: a prior that no recording changes
 
 
 class Known(eqx.Module):
@@ -234,7 +237,7 @@ def given(
     seen = Inspected(recording)
     estimator = cast(MaximumLikelihood, named(fit.method))
     lane = (HarmonicsWithCurrent if estimator.with_current else Harmonics).of(seen)
-    late = lane.late_by(fit.circuit, feed)  # as `etid.identify.one.repeated` does it
+    late = lane.late_by(fit.circuit, feed)  # as `etid.identify.fitting.refitted` does it
     seen.realign(*late)
     lane = lane.realigned(late)
     if int(fit.remarks) & Remark.mains_hum:
@@ -260,3 +263,50 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
     if not (np.isfinite(cov).all() and (np.linalg.eigvalsh(cov) > 0).all()):
         raise ValueError(f"the recording does not determine all elements of {fit}")
     return cov
+
+
+@program
+def _effects(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Float[Array, "z element"]:
+    """Change of the logarithms of the elements by each z, whose prior is standard normal.
+
+    It is the column of z in H⁻¹ (`etid.estimators.sandwich`).
+    """
+    load = terms_of(lane, known, circuit)
+    gains = load.gains
+    start = [circuit.log_values(), jnp.zeros(gains.outputs), known.driver.mean]
+    found = least(load, jnp.concatenate(start))[1]
+    return load_fit.covariance_of_priors(load, found)[gains.owned :, : gains.elements]
+
+
+@in_float64
+def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budget:
+    """`Fit.budget`."""
+    recording, driver = fit.source_or_own(recording, driver)
+    if not isinstance(driver, HarmonicDriver):
+        raise ValueError(
+            "a budget needs the driver of the fit, with the harmonics of its calibrations; "
+            "identify it by maximum likelihood, and pass it as in fit.budget(recording, driver)"
+        )
+    stated = (driver.instrument or Instrument()).stored()
+    narrow = {name: stated[name] or NARROW * size for name, (_, size) in TOLERANCES.items()}
+    asked = dataclasses.replace(driver, instrument=Instrument(**narrow).as_arrays())
+    lane, known, _ = given(fit, recording, asked)
+    effects = np.asarray(_effects(lane, known, fit.circuit))
+    gain, crosstalk, capacitance, *r_load = effects[-3 - driver.calibration.r_load.size :]
+    of = {"gain": gain, "crosstalk": crosstalk, "capacitance": capacitance}
+    of |= {"r_load": np.sqrt(np.sum(np.square(r_load), axis=0))}  # independent resistors
+    values = np.asarray(fit.circuit.values())
+    cov, shared = (np.diagonal(np.asarray(of)) / values**2 for of in (fit.cov, fit.shared_cov))
+    of = {name: np.abs(effect) for name, effect in of.items()}
+    instrument = {name: of[name] for name, size in stated.items() if size}
+    rest = shared - sum(part**2 for part in instrument.values())
+    return Budget(
+        names=fit.circuit.names(),
+        parts={
+            "recording": np.sqrt(cov - shared),
+            "driver": np.sqrt(np.maximum(rest, 0.0)),
+            **instrument,
+        },
+        tolerances={name: size for name, size in stated.items() if size},
+        unstated={name: of[name] / NARROW for name, size in stated.items() if not size},
+    )

@@ -10,7 +10,7 @@ from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import Harmonics
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method
 from etid.identify.arguments import require
-from etid.identify.one import skin_lane
+from etid.identify.fitting import skin_lane
 from etid.identify.options import Options, candidates_of, check_default
 from etid.precision import in_float64
 from etid.recordings.remarks import Remark

@@ -49,7 +49,7 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import circuit_of, number_of, require
-from etid.identify.one import known_at
+from etid.identify.fitting import known_at
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.online.alarms import limit

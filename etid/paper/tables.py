@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from etid.circuits.circuit import Resistor, SkinRC
 from etid.identify.driver import identify_driver
-from etid.identify.many import identify_skins
+from etid.identify.skins import identify_skins
 from etid.recordings.study import Study
 from etid.results.driver import Driver
 from etid.results.fits import Fits

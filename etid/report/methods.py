@@ -21,8 +21,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, described
 from etid.report.html import Section, Table
 from etid.results.driver import ContinuousDriver
 from etid.results.fits import AND, Fits, joined
-from etid.results.provenance import Settings
-from etid.results.study_fits import StudyFits
+from etid.results.study_fits import Settings, StudyFits
 from etid.selection.common import LIMIT
 
 

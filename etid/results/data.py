@@ -14,8 +14,8 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import Circuit
 from etid.recordings.recording import Recording
-from etid.results.budget import Budget
 from etid.results.driver import Driver
+from etid.results.instrument import Budget
 from etid.results.posterior import Posterior, Profile
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ class HasSource(Generic[Circuit]):
         Raises:
             ValueError: As in `posterior`, or the driver has no harmonics of its calibrations.
         """
-        return _of_higher_layer("etid.identify.budget", "budget")(self, recording, driver)
+        return _of_higher_layer("etid.identify.posterior", "budget")(self, recording, driver)
 
 
 def with_data(

@@ -4,7 +4,7 @@ import dataclasses
 import importlib.metadata
 import itertools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Generic
 
 import jax
@@ -23,9 +23,19 @@ from etid.results.verdicts import counted, counts
 AND = " + "  # between the names of estimators
 
 
-def joined(methods: Sequence[str]) -> str:
+def joined(methods: Iterable[str]) -> str:
     """One name for fits by several estimators; it holds each estimator once."""
     return AND.join(sorted({name for method in methods for name in method.split(AND)}))
+
+
+def concatenated(fits: Sequence[Fit]) -> Fit:
+    """Fits of several parts; those that were refused have no χ², and their method was not used."""
+    used = [one.method for one in fits if np.isfinite(one.chi2).any()]
+    method = joined(used or [one.method for one in fits])
+    parts = [dataclasses.replace(one, method=method) for one in fits]
+    if any(one.limits is not None for one in parts):
+        parts = [dataclasses.replace(one, limits=one.all_limits) for one in parts]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -87,14 +97,10 @@ class Fits(Overviewed, Generic[Circuit]):
             parts: Tables of fits of circuits of one kind.
 
         Returns:
-            All fits, in this order. The name of the method lists all their methods.
+            All fits, in this order.
         """
-        method = joined([part.fit.method for part in parts])
-        fits = [dataclasses.replace(part.fit, method=method) for part in parts]
-        if any(fit.limits is not None for fit in fits):
-            fits = [dataclasses.replace(fit, limits=fit.all_limits) for fit in fits]
         return cls(
-            jax.tree.map(lambda *leaves: np.concatenate(leaves), *fits),
+            concatenated([part.fit for part in parts]),
             {name: np.concatenate([part.labels[name] for part in parts]) for name in DESCRIBED},
             np.concatenate([part.notes for part in parts]),
         )

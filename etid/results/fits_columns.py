@@ -12,8 +12,8 @@ from etid.circuits.lookup import circuit_class
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of
+from etid.results.fit import Limited
 from etid.results.hdf5_table import Table, same_length
-from etid.results.limited import Limited
 from etid.results.verdicts import RESULTS, verdicts_of
 
 SCHEMA = "etid/fits"

@@ -1,5 +1,7 @@
-"""What an instrument may do that no recording shows: a budget of stated tolerances."""
+"""Errors of an instrument that no recording shows, and what each adds to the standard errors."""
 
+import dataclasses
+from collections.abc import Mapping
 from typing import TypeVar
 
 import equinox as eqx
@@ -7,11 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from etid.circuits.overview import Overview, Overviewed
+
 _Number = float | Float[Array | np.ndarray, ""]
 _Kind = TypeVar("_Kind", bound="Instrument")
 
-# Largest possible value of each field; a larger one has a wrong unit.
-LARGEST = {"gain": 1.0, "r_load": 1.0, "crosstalk": 1.0, "capacitance": 1e-7}
+# Largest possible value of each tolerance, above which it has a wrong unit; and the value for which
+# a budget shows the effect of an error that nobody stated [relative, F].
+TOLERANCES = {
+    "gain": (1.0, 1e-3),
+    "r_load": (1.0, 1e-3),
+    "crosstalk": (1.0, 1e-3),
+    "capacitance": (1e-7, 1e-12),
+}
 
 
 class Instrument(eqx.Module):
@@ -35,7 +45,7 @@ class Instrument(eqx.Module):
     capacitance: _Number = 0.0
 
     def __check_init__(self) -> None:
-        for name, largest in LARGEST.items():
+        for name, (largest, _) in TOLERANCES.items():
             value = getattr(self, name)
             if isinstance(value, int | float) and not 0 <= value < largest:
                 unit = "F" if name == "capacitance" else "relative to the value"
@@ -50,8 +60,51 @@ class Instrument(eqx.Module):
 
     def stored(self) -> dict[str, float]:
         """The numbers by name."""
-        return {name: float(getattr(self, name)) for name in LARGEST}
+        return {name: float(getattr(self, name)) for name in TOLERANCES}
 
     def as_arrays(self: _Kind) -> _Kind:
         """The same with arrays, which a traced program takes as operands."""
         return type(self)(**{name: np.asarray(value) for name, value in self.stored().items()})
+
+
+def _named(source: str, size: float) -> str:
+    """A source with its size, as in "gain 0.1 %"."""
+    return (
+        f"{source} {size * 1e12:g} pF" if source == "capacitance" else f"{source} {100 * size:g} %"
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Budget(Overviewed):
+    """The uncertainty budget of a fit (JCGM 100, the GUM). All numbers are relative.
+
+    Attributes:
+        names: The elements.
+        parts: Standard deviation that each source adds to each element, by the source: the
+            recording, its driver (noise of the calibrations, and drift), and each stated tolerance
+            of the instrument.
+        tolerances: The stated tolerances [relative, F].
+        unstated: Size of the change of each element by an error of the instrument that nobody
+            stated, of the size in `TOLERANCES`.
+    """
+
+    names: tuple[str, ...]
+    parts: Mapping[str, Float[np.ndarray, " element"]]
+    tolerances: Mapping[str, float]
+    unstated: Mapping[str, Float[np.ndarray, " element"]]
+
+    @property
+    def together(self) -> Float[np.ndarray, " element"]:
+        """Relative standard errors of the elements, from all sources."""
+        return np.sqrt(sum(part**2 for part in self.parts.values()))
+
+    def _overview(self) -> Overview:
+        shown = dict[str, Float[np.ndarray, " element"]]()
+        for source, part in self.parts.items():
+            size = self.tolerances.get(source)
+            shown[source if size is None else _named(source, size)] = part
+        shown["together"] = self.together
+        for source, change in self.unstated.items():
+            shown[f"if {_named(source, TOLERANCES[source][1])}"] = change
+        rows = [(name, *(f"± {100 * of:.2g} %" for of in part)) for name, part in shown.items()]
+        return Overview("Budget of the standard errors", rows, ("", *self.names))

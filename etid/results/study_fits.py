@@ -6,6 +6,7 @@ dataset `drivers` with one line of JSON for each driver. `etid.Fits.read` ignore
 
 import dataclasses
 import functools
+import importlib.metadata
 import itertools
 import json
 import math
@@ -30,14 +31,72 @@ from etid.results.driver import (
     ContinuousDriver,
     DiscreteDriver,
     Driver,
+    OrderEvidence,
     SourceImpedance,
 )
 from etid.results.fits import SCHEMA, Fits
 from etid.results.hdf5_table import REMEDY, Table, opened_table, write_table
-from etid.results.instrument import LARGEST, Instrument
-from etid.results.provenance import Settings
-from etid.results.tried_orders import OrderEvidence
+from etid.results.instrument import TOLERANCES, Instrument
 from etid.results.verdicts import verdicts_of
+
+# |Z_th| [Ω] at 1 kHz: from the transformer of a microphone to the transformer of a tube.
+PLAUSIBLE = (300.0, 300e3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of a run. They hold no date, so that equal runs have equal settings.
+
+    Attributes:
+        source: Absolute path of the file of recordings; empty if they were in memory.
+        source_size: Size of the file [byte], which detects another file of the same name; 0 if
+            the recordings were in memory.
+        recordings: Number of recordings to identify.
+        asked_method: The method that the user chose; empty if etid chose it for each recording.
+        order: Number of poles of Z_th; 0 if etid chose it from the calibrations of each driver.
+        start: Typical values of the elements [SI]; fits start around them.
+        candidates: Names of the circuits from which that of all recordings was chosen; empty if
+            the user chose it.
+        r_load_tolerance: Relative standard deviation of the known resistors that is included in
+            the standard errors.
+        driver_drift: As in `identify_driver`.
+        fixed: Known elements and their values [SI], such as `"r_s 500.0"`.
+        prior: Elements with a prior, values and standard deviations [SI], such as
+            `"r_s 500.0 ± 50.0"`.
+        bounds: Elements with bounds [SI], such as `"r_s 100.0 to 2000.0"` or
+            `"r_s above 100.0"`.
+        precision: Floating-point type of the computation.
+        backend: Backend of JAX, such as `"cpu"`.
+        versions: Packages and their versions, such as `"jax 0.10.2"`.
+        plausible: As in `identify_driver`. Files of earlier versions do not store it.
+        instrument: Tolerances of the instrument that are not 0 [SI], such as `"gain 0.001"`. Files
+            of earlier versions do not store them.
+    """
+
+    source: str
+    source_size: int
+    recordings: int
+    asked_method: str
+    order: int
+    start: tuple[float, ...]
+    candidates: tuple[str, ...]
+    r_load_tolerance: float
+    driver_drift: float
+    fixed: tuple[str, ...]
+    prior: tuple[str, ...]
+    bounds: tuple[str, ...]
+    precision: str
+    backend: str
+    versions: tuple[str, ...]
+    plausible: tuple[float, ...] = PLAUSIBLE
+    instrument: tuple[str, ...] = ()
+
+
+@functools.cache
+def versions() -> tuple[str, ...]:
+    """Packages and their versions; to look them up on disk takes as long as three skins."""
+    packages = ("etid", "jax", "jaxlib", "optimistix", "equinox", "numpy")
+    return tuple(f"{name} {importlib.metadata.version(name)}" for name in packages)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -170,8 +229,7 @@ def _settings(table: Table) -> Settings | None:
 def _of_line(line: str) -> tuple[tuple[str, ...], Driver | str]:
     """Paths of the calibrations, and the driver or the reason why there is none.
 
-    Raises:
-        ValueError, TypeError, KeyError, OverflowError, RecursionError: The line is damaged.
+    A damaged line raises any error of `json` or of an array.
     """
     stored = json.loads(line)
     paths = stored["calibrations"]
@@ -184,10 +242,14 @@ def _of_line(line: str) -> tuple[tuple[str, ...], Driver | str]:
     return tuple(paths), stored["failure"]
 
 
-def _lists(module: Any) -> dict[str, Any]:
-    """The arrays of a module as nested lists."""
-    names = (field.name for field in dataclasses.fields(module))
-    return {name: np.asarray(getattr(module, name)).tolist() for name in names}
+def _lists(module: Any, *names: str) -> dict[str, Any]:
+    """Some arrays of a module as nested lists, or all; None for what it does not have."""
+    names = names or tuple(field.name for field in dataclasses.fields(module))
+    values = {name: getattr(module, name) for name in names}
+    return {
+        name: None if value is None else np.asarray(value).tolist()
+        for name, value in values.items()
+    }
 
 
 def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
@@ -195,23 +257,15 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
         "calibrations": paths,
         "method": driver.method,
         "verdict": driver.verdict,
-        "steps": int(driver.steps),
         "remarks": words(int(driver.remarks)),
-        "rrse": float(driver.rrse),
-        "chi2": float(driver.chi2),
-        "b": np.asarray(driver.b).tolist(),
-        "a": np.asarray(driver.a).tolist(),
-        "sample_rate": float(driver.sample_rate),
+        **_lists(driver, "steps", "rrse", "chi2", "b", "a", "sample_rate"),
     }
     if isinstance(driver, ContinuousDriver):
         stored |= {
-            "drift": None if driver.drift is None else float(driver.drift),
+            **_lists(driver, "drift", "cov"),
+            **_lists(driver.calibration, "r_load", "delay_samples", "delay_std_samples"),
             "instrument": None if driver.instrument is None else driver.instrument.stored(),
             "source": _lists(driver.source),
-            "cov": np.asarray(driver.cov).tolist(),
-            "r_load": np.asarray(driver.calibration.r_load).tolist(),
-            "delay_samples": np.asarray(driver.calibration.delay_samples).tolist(),
-            "delay_std_samples": float(driver.calibration.delay_std_samples),
             "tried": _lists(driver.tried),
         }
     return json.dumps(stored)
@@ -219,90 +273,71 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
 
 @in_float64
 def _from_json(stored: Mapping[str, Any]) -> Driver:
-    """A driver from the result of `_to_json`, which does not hold harmonics of calibrations.
-
-    Raises:
-        ValueError, TypeError, KeyError, OverflowError: The line is damaged.
-    """
+    """A driver from the result of `_to_json`, which does not hold harmonics of calibrations."""
     if not all(isinstance(stored[name], str) for name in ("method", "verdict")):
         raise TypeError("method and verdict must be texts")
-    rate = float(_numbers(stored, "sample_rate", 0))
+    rate = float(_numbers(stored, "sample_rate"))
     if not 0 < rate < math.inf:
         raise ValueError(f"sample_rate is {rate}")
     kind = DiscreteDriver if "source" not in stored else _continuous(stored)
     return kind(
-        b=_numbers(stored, "b", 1),
-        a=_numbers(stored, "a", 1),
+        b=_numbers(stored, "b", None),
+        a=_numbers(stored, "a", None),
         sample_rate=rate,
-        rrse=_numbers(stored, "rrse", 0),
-        chi2=_numbers(stored, "chi2", 0),
+        rrse=_numbers(stored, "rrse"),
+        chi2=_numbers(stored, "chi2"),
         result=verdicts_of(np.asarray(stored["verdict"])),
-        steps=jax.device_put(np.asarray(_numbers(stored, "steps", 0)).astype(int)),
+        steps=jax.device_put(np.asarray(_numbers(stored, "steps")).astype(int)),
         method=stored["method"],
         remarks=np.asarray(remarks_of(stored.get("remarks", ""))),
     )
 
 
 def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
-    """`ContinuousDriver` with the fields that a discrete driver does not have."""
+    """`ContinuousDriver` with the fields that a discrete driver does not have.
+
+    Files of earlier versions have no instrument and no orders that were tried.
+    """
     own = stored["source"]
-    pairs = len(_numbers(own, "log_omega", 1))
-    reals = len(_numbers(own, "log_omega_real", 1))
-    shapes = {
-        "log_resistance": (),
-        **dict.fromkeys(("log_omega", "log_zeta", "gain", "slope"), (pairs,)),
-        **dict.fromkeys(("log_omega_real", "gain_real"), (reals,)),
-    }
-    fields = {name: _numbers(own, name, len(shape), shape) for name, shape in shapes.items()}
-    source = SourceImpedance(**fields)
-    size = sum(leaf.size for leaf in jax.tree.leaves(source))
-    r_load = _numbers(stored, "r_load", 1)
-    delay = _numbers(stored, "delay_samples", 1, r_load.shape)
+    pairs = _numbers(own, "log_omega", None).size
+    reals = _numbers(own, "log_omega_real", None).size
+    source = SourceImpedance(
+        log_resistance=_numbers(own, "log_resistance"),
+        **{name: _numbers(own, name, pairs) for name in ("log_omega", "log_zeta", "gain", "slope")},
+        **{name: _numbers(own, name, reals) for name in ("log_omega_real", "gain_real")},
+    )
+    size = 1 + 4 * pairs + 2 * reals
+    r_load = _numbers(stored, "r_load", None)
+    delays = _numbers(stored, "delay_samples", r_load.size), _numbers(stored, "delay_std_samples")
+    instrument, tried = stored.get("instrument"), OrderEvidence.none()
+    if instrument is not None:
+        numbers = {name: float(_numbers(instrument, name)) for name in TOLERANCES}
+        instrument = Instrument(**numbers).as_arrays()
+    if "tried" in stored:
+        of, orders = stored["tried"], tried.bic.size
+        adequate = np.asarray(of["adequate"])
+        if adequate.dtype.kind != "b" or adequate.shape != (orders,):
+            raise TypeError(f"adequate is {reprlib.repr(of['adequate'])}")
+        bic, missing_pole = (
+            np.asarray(_numbers(of, name, orders)) for name in ("bic", "missing_pole")
+        )
+        tried = OrderEvidence(bic, missing_pole, adequate)
     return functools.partial(
         ContinuousDriver,
         source=source,
-        cov=_numbers(stored, "cov", 2, (size, size)),
-        calibration=Calibration(r_load, delay, _numbers(stored, "delay_std_samples", 0)),
-        drift=None if stored.get("drift") is None else _numbers(stored, "drift", 0),
-        instrument=_instrument(stored.get("instrument")),
-        tried=_tried(stored["tried"]) if "tried" in stored else OrderEvidence.none(),
+        cov=_numbers(stored, "cov", size, size),
+        calibration=Calibration(r_load, *delays),
+        drift=None if stored.get("drift") is None else _numbers(stored, "drift"),
+        instrument=instrument,
+        tried=tried,
     )
 
 
-def _instrument(stored: Mapping[str, Any] | None) -> Instrument | None:
-    """The tolerances of the instrument; files of earlier versions have none.
-
-    Raises:
-        ValueError, TypeError, KeyError, OverflowError: The line is damaged.
-    """
-    if stored is None:
-        return None
-    return Instrument(**{name: float(_numbers(stored, name, 0)) for name in LARGEST}).as_arrays()
-
-
-def _tried(stored: Mapping[str, Any]) -> OrderEvidence:
-    """The orders that were tried.
-
-    Raises:
-        ValueError, TypeError, KeyError, OverflowError: The line is damaged.
-    """
-    shape = OrderEvidence.none().bic.shape
-    bic, missing_pole = (
-        np.asarray(_numbers(stored, name, 1, shape)) for name in ("bic", "missing_pole")
-    )
-    adequate = np.asarray(stored["adequate"])
-    if adequate.dtype.kind != "b" or adequate.shape != shape:
-        raise TypeError(f"adequate is {reprlib.repr(stored['adequate'])}")
-    return OrderEvidence(bic, missing_pole, adequate)
-
-
-def _numbers(
-    stored: Mapping[str, Any], name: str, dimensions: int, shape: tuple[int, ...] | None = None
-) -> Array:
-    """A field as an array of numbers; its dimensions and its shape, if given, are checked."""
+def _numbers(stored: Mapping[str, Any], name: str, *shape: int | None) -> Array:
+    """A field as an array of numbers of this shape, in which None is any length."""
     found = np.asarray(stored[name])
-    if found.dtype.kind not in "iuf" or found.ndim != dimensions:
+    if found.dtype.kind not in "iuf" or found.ndim != len(shape):
         raise TypeError(f"{name} is {reprlib.repr(stored[name])}")
-    if shape is not None and found.shape != shape:
+    if any(wanted not in (None, size) for wanted, size in zip(shape, found.shape, strict=True)):
         raise ValueError(f"{name} has shape {found.shape}, must be {shape}")
     return jax.device_put(found.astype(float))

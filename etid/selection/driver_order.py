@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from etid.results.tried_orders import LARGEST, LEAST, OrderEvidence
+from etid.results.driver import LARGEST, LEAST, OrderEvidence
 
 PER_POLE = 2  # unknowns of one more pole: its rate and its gain
 

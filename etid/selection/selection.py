@@ -11,7 +11,6 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
-from etid.results.residuals import looks_like
 from etid.results.verdicts import message
 from etid.selection.evidence import bic, elements, rank, weights, with_close
 from etid.selection.search import PATIENCE, asked
@@ -122,7 +121,7 @@ class Selection(Overviewed):
             return fit.changes
         if int(fit.remarks) & Remark.mains_hum:
             return "The residual looks like mains hum."
-        return "" if fit.support is None else looks_like(np.asarray(fit.support.z))
+        return "" if fit.support is None else fit.support.looks_like()
 
     def _overview(self) -> Overview:
         total = len(self.candidates) + len(self.unasked) + len(self.late)

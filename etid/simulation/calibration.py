@@ -16,15 +16,14 @@ from etid.circuits.circuit import Resistor, SkinRC
 from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
 from etid.identify.driver import identify_driver
-from etid.identify.one import identify_skin
+from etid.identify.skins import identify_skin
 from etid.precision import in_float64
 from etid.recordings.hdf5 import read
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
-from etid.results.driver import Driver
+from etid.results.driver import AUTO, Driver, Order
 from etid.results.fit import Fit, IdentificationError
-from etid.results.tried_orders import AUTO, Order
 from etid.simulation.published import TYPICAL
 
 SKINS = {name: SkinRC(**dataclasses.asdict(skin)) for name, skin in TYPICAL.items()}

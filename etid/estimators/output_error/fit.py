@@ -51,8 +51,8 @@ from etid.estimators.output_error.prediction import (
 from etid.estimators.sandwich import Curvature
 from etid.estimators.score_tests.other_in_time import EXACT, Shown, bends, relaxed, score
 from etid.estimators.unknowns import Nuisance
-from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance, loaded
-from etid.results.feed import CurrentSource, MeasuredCurrent
+from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
+from etid.results.feed import CurrentSource, MeasuredCurrent, loaded
 from etid.results.fit import CHANGES, Support, rrse
 from etid.signals.filtering import CUTOFF, StateSpace
 from etid.signals.transfer import Rational

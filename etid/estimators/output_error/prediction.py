@@ -20,8 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from etid.estimators.unknowns import Nuisance
-from etid.results.driver import SourceImpedance, loaded
-from etid.results.feed import CurrentSource
+from etid.results.feed import CurrentSource, SourceImpedance, loaded
 from etid.signals.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, shiftable, simulate
 from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational

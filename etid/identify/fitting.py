@@ -1,16 +1,25 @@
-"""Identification of one skin: pre-flight, refinement, verdict. Batches share these steps."""
+"""The fit of a batch of recordings that share a driver: fitted, fitted again, judged.
+
+Recordings of one length share one compiled function. It takes up to `LANES` recordings, so that
+memory is bounded. A CPU fits them one after the other: side by side (`vmap`) they take twice the
+time, even with equal numbers of steps. Accelerators fit them side by side. NumPy fits few.
+
+A recording is fitted again if it is late, after a shift of its records, and if hum may explain what
+its fit misses, without the mains harmonics.
+"""
 
 import dataclasses
 import functools
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, TypeVar, Unpack, overload
+from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import (
@@ -23,168 +32,25 @@ from etid.estimators.lanes import (
     unstacked,
 )
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
-from etid.estimators.registry import Method
 from etid.identify import changes
-from etid.identify.arguments import fed
-from etid.identify.options import (
-    Circuit,
-    FitOptions,
-    Interval,
-    Options,
-    candidates_of,
-    check_default,
-    plan,
-)
-from etid.identify.planning import EXPLAINED, explained, failed_fit
-from etid.numpy_tier.tiers import program
-from etid.precision import in_float64
+from etid.numpy_tier.tiers import program, worth_compiling
 from etid.recordings.preflight import Inspected
-from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
-from etid.results.data import with_data
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
-from etid.results.fit import Fit, IdentificationError, Support
+from etid.results.fit import Fit, Support
 from etid.results.verdicts import message, verdicts_of
 from etid.selection.evidence import best
 from etid.selection.search import search
-from etid.selection.selection import Selection
 
-NOTED = ("changed", "out_of_bounds", "inconsistent")  # verdicts to which `note` adds numbers
+LANES = 64  # lanes of one call; the last call is padded
+FEWEST = 16  # recordings that are read and fitted at once, however long they are
+HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least `FEWEST`
 SPARSE = 16  # every 16th sample enters a checksum
 KEPT = 4  # drivers, for which `known_of` is kept
-_Kind = TypeVar("_Kind", bound=AbstractCircuit)
+NOTED = ("changed", "out_of_bounds", "inconsistent")  # verdicts to whose message a note adds
 _Outcome = TypeVar("_Outcome", Fit, Driver)
-
-
-@overload
-def identify_skin(
-    recording: Recording,
-    driver: Driver | None = None,
-    *,
-    circuit: None = None,
-    throw: bool = True,
-    **options: Unpack[FitOptions],
-) -> Fit[SkinRC]: ...
-
-
-@overload
-def identify_skin(
-    recording: Recording,
-    driver: Driver | None = None,
-    *,
-    circuit: _Kind,
-    throw: bool = True,
-    **options: Unpack[FitOptions],
-) -> Fit[_Kind]: ...
-
-
-@overload
-def identify_skin(
-    recording: Recording,
-    driver: Driver | None = None,
-    *,
-    circuit: str,
-    throw: bool = True,
-    **options: Unpack[FitOptions],
-) -> Fit[AbstractCircuit]: ...
-
-
-@in_float64
-def identify_skin(
-    recording: Recording,
-    driver: Driver | None = None,
-    *,
-    circuit: Circuit = None,
-    method: Method | None = None,
-    fixed: Mapping[str, float] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-    bounds: Mapping[str, Interval] | None = None,
-    throw: bool = True,
-) -> Fit:
-    """Identify the circuit that is connected to the driver in one recording.
-
-    Args:
-        recording: Unloaded and loaded voltage.
-        driver: Identified driver. Without a driver the load is identified from the current that the
-            recording measured. With a driver, the default method uses a measured current too.
-        circuit: Structure of the load and its typical values, or a circuit string such as
-            `"R0-p(R1,C1)"`; `SkinRC` if not given. With `"auto"` it is the simplest circuit that
-            the recording supports; `select_circuit` shows the choice.
-        method: A method of `identify_driver`, or `"non_parametric"`, which uses the drivers of
-            maximum likelihood, or any registered name.
-        fixed: Known values of elements by name [SI], as in `{"r_s": 500.0}`. Their standard errors
-            are 0.
-        prior: Values of elements with their standard deviations, as in `{"r_s": (500.0, 50.0)}`;
-            the standard errors of the fit contain this knowledge. Each set of values compiles a
-            program of its own. Maximum likelihood and output error take known elements.
-        bounds: Least and largest possible values of elements [SI], as in `{"r_s": (100.0, 2e3)}`;
-            None where there is none. The estimate is the mean of what the likelihood leaves inside,
-            and the standard errors are its own. The remark `at_bound` says that an element would
-            lie outside without its bounds; the verdict `out_of_bounds` that they contradict the
-            recording. They take the methods that take known elements.
-        throw: Raise an error if the verdict is not successful.
-
-    Returns:
-        Elements, standard errors and verdict. The fit knows its recording and its driver, so that
-        `fit.plot()`, `fit.posterior()` and `fit.profile("c_p")` need no arguments.
-
-    Raises:
-        ValueError: The method cannot use this driver or this circuit.
-        IdentificationError: The verdict is not successful and `throw` is set.
-    """
-    options = Options.of(
-        candidates_of(circuit), method=method, fixed=fixed, prior=prior, bounds=bounds
-    )
-    fits, chosen = candidate_fits(recording, driver, options)
-    single = len(options.circuits) == 1
-    fit = fits[chosen] if single else Selection.of(fits, chosen, options.circuits).fit
-    fit = with_data(fit, recording, driver)
-    return successful(recording, fit) if throw else fit
-
-
-def candidate_fits(
-    recording: Recording, driver: Driver | None, options: Options
-) -> tuple[dict[int, Fit], int]:
-    """Fits of the circuits that a recording asks for, and the number of the chosen one.
-
-    Raises:
-        ValueError: The method cannot use this driver.
-    """
-    recording, feed = fed(recording, driver)
-    seen = Inspected(recording)
-    estimator, name = plan(options, seen, feed)
-    if name is not None:
-        return {0: failed_fit(name, options, str(estimator))}, 0
-    check_default(estimator, options.circuits)
-    lane = estimator.lane.of(seen)
-    known = known_of(lane, feed, is_shared(seen, feed), estimator)
-
-    def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
-        found = [skin(lane, feed, known, circuit, estimator) for lane in lanes]
-        return stacked(jax.device_get(found))
-
-    found = refined([lane], [seen], fit, feed, options.circuits)
-    found = judged(found, feed, [seen], estimator)
-    return found[0], found.chosen(0)
-
-
-def successful(recording: Recording, fit: Fit) -> Fit:
-    """The fit.
-
-    Raises:
-        IdentificationError: Its verdict is not successful.
-    """
-    if fit.verdict == "successful":
-        return fit
-    why = note(fit)
-    if fit.verdict in EXPLAINED:
-        why = explained(Inspected(recording), fit.verdict)
-    raise IdentificationError(f"recording {recording.path!r}: {fit.verdict}. {why}", fit)
-
-
-# --- Steps that one recording and batches share ---------------------------------------------------
 
 
 def skin_lane(
@@ -198,18 +64,43 @@ def skin_lane(
     return estimator.fit_load(lane, driver, known, circuit)
 
 
-_skin = program(skin_lane)
+skin = program(skin_lane)
 
 
-def skin(
-    lane: Any,
+@functools.partial(program, batch=True)
+def _chunk(
+    lanes: Any,
+    count: Int[Array, ""],
     driver: AbstractFeed,
     known: Any,
     circuit: AbstractCircuit,
     estimator: AbstractEstimator,
 ) -> Fit:
-    """`skin_lane`, compiled. In a notebook, compilation takes longer than all fits."""
-    return _skin(lane, driver, known, circuit, estimator)
+    return each(lambda lane: skin_lane(lane, driver, known, circuit, estimator), lanes, count)
+
+
+def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> Any:
+    """Results of `fit` for the first `count` lanes; zeros for the others on a CPU."""
+    if jax.default_backend() != "cpu":
+        return jax.vmap(fit)(lanes)
+    once = jax.jit(fit)  # so that the shapes and the calls need one trace only
+    first = jax.tree.map(lambda leaf: leaf[0], lanes)
+    shapes = jax.eval_shape(once, first)
+
+    def nothing(_) -> Any:
+        return jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes)
+
+    def one(numbered: tuple[Int[Array, ""], Any]) -> Any:
+        number, lane = numbered
+        return jax.lax.cond(number < count, once, nothing, lane)
+
+    size = jax.tree.leaves(lanes)[0].shape[0]
+    return jax.lax.map(one, (jnp.arange(size), lanes))
+
+
+def filled(lanes: Sequence[AbstractLane]) -> AbstractLane:
+    """`LANES` lanes, padded with copies of the last lane."""
+    return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
 
 
 @program  # once for each driver
@@ -254,8 +145,43 @@ def _known_of(driver: _Same, frequency: bytes, shared: bool, estimator: Abstract
     return known_at(jax.device_put(np.frombuffer(frequency)), driver.driver, shared, estimator)
 
 
+def checksum(seen: Inspected) -> int:
+    """Checksum that identifies an unloaded record; a part of its noise is enough."""
+    return zlib.crc32(seen.v_th[::SPARSE].tobytes())
+
+
+def is_shared(seen: Inspected, driver: AbstractFeed) -> bool:
+    """Whether a recording and a calibration may share one unloaded record."""
+    known = driver.unloaded if isinstance(driver, HarmonicDriver) else None
+    return known is None or checksum(seen) in known
+
+
+class Prepared(NamedTuple):
+    """A recording that can be fitted.
+
+    Attributes:
+        seen: The recording and its properties.
+        driver: Its driver.
+        estimator: Its estimator.
+        lane: Its arrays.
+        shared: Whether it and a calibration may share one unloaded record.
+    """
+
+    seen: Inspected
+    driver: AbstractFeed
+    estimator: AbstractEstimator
+    lane: AbstractLane
+    shared: bool
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Equal for recordings that one call can fit."""
+        rates = self.seen.recording.sample_rate, self.seen.recording.pulse_rate
+        return id(self.driver), self.estimator, self.lane.shapes, self.shared, rates
+
+
 @dataclasses.dataclass
-class Tried:
+class CandidateFits:
     """Fits of several recordings.
 
     Attributes:
@@ -289,14 +215,8 @@ class Tried:
 
     def concluded(
         self, driver: AbstractFeed, remarks: Sequence[int], repeats: Sequence[Repeats | None]
-    ) -> "Tried":
-        """The same; the chosen fits are `concluded`.
-
-        Args:
-            driver: The driver of these fits.
-            remarks: Remarks on the recordings.
-            repeats: The periods of the recordings.
-        """
+    ) -> "CandidateFits":
+        """The same; the chosen fits are `concluded`, whose arguments these are."""
         first, own = concluded(self.first, driver, remarks, repeats), dict(self.own)
         of_number: dict[int, list[int]] = {}
         for row in own:
@@ -306,7 +226,7 @@ class Tried:
             fits = concluded(stacked([own[row][number] for row in rows]), driver, *of_rows)
             for place, row in enumerate(rows):
                 own[row] = {**own[row], number: taken(fits, place)}
-        return Tried(first, own)
+        return CandidateFits(first, own)
 
     @property
     def only(self) -> Fit:
@@ -315,58 +235,62 @@ class Tried:
         return replaced(self.first, rows, stacked(fits)) if rows else self.first
 
 
-_Several = TypeVar("_Several", Tried, list[Any])
+def _chosen(fits: dict[int, Fit]) -> int:
+    """Number of the candidate to choose; without a choice, no reader needs to know how it goes."""
+    return best(fits) if len(fits) > 1 else next(iter(fits))
 
 
-def repeated(
+_Several = TypeVar("_Several", CandidateFits, list[Any])
+
+
+def refitted(
     lanes: Sequence[AbstractLane],
     seen: Sequence[Inspected],
     fit: Callable[[Sequence[AbstractLane]], _Several],
     late_by: Callable[[Sequence[AbstractLane], _Several], Mapping[int, Lags]],
-    need_another: Callable[[_Several], Iterable[int]],
-    of_both: Callable[[Any, Any], Any],
+    may_hum: Callable[[_Several], Iterable[int]],
+    better: Callable[[Any, Any], Any],
 ) -> _Several:
     """Fits of lanes, some of them fitted again.
-
-    A lane that is late is realigned and fitted again. A lane with hum is fitted again without the
-    mains harmonics.
 
     Args:
         lanes: Lanes of the recordings.
         seen: The recordings. The function corrects the lag of those that are late.
         fit: Fits lanes. Each lane can be read from the result and written into it by its number.
         late_by: Lags of lanes behind their fits, by number; only those that are late.
-        need_another: Numbers of the lanes whose fits show hum, or that hum may explain.
-        of_both: The better of two fits of a lane; the second is without the mains harmonics.
+        may_hum: Numbers of the lanes whose fits show hum, or that hum may explain.
+        better: The better of two fits of a lane; the second is without the mains harmonics.
     """
     lanes = list(lanes)
+
+    def aligned(found: _Several) -> dict[int, AbstractLane]:
+        late = late_by(lanes, found)
+        for row, by in late.items():
+            seen[row].realign(*by)
+            lanes[row] = lanes[row].realigned(by)
+        return {row: lanes[row] for row in late}
+
+    def without_mains(found: _Several) -> dict[int, AbstractLane]:
+        less = {row: lanes[row].without_mains() for row in may_hum(found)}
+        return {row: lane for row, lane in less.items() if lane is not None}
+
     found = fit(lanes)
-    late = late_by(lanes, found)
-    for row, by in late.items():
-        seen[row].realign(*by)
-        lanes[row] = lanes[row].realigned(by)
-    if late:
-        again = fit([lanes[row] for row in late])
-        for number, row in enumerate(late):
-            found[row] = again[number]
-    few = {
-        row: less for row in need_another(found) if (less := lanes[row].without_mains()) is not None
-    }
-    if few:
-        again = fit(list(few.values()))
-        for number, row in enumerate(few):
-            found[row] = of_both(found[row], again[number])
+    for reason, choose in ((aligned, lambda _, second: second), (without_mains, better)):
+        if changed := reason(found):
+            again = fit(list(changed.values()))
+            for number, row in enumerate(changed):
+                found[row] = choose(found[row], again[number])
     return found
 
 
-def refined(
+def refitted_loads(
     lanes: Sequence[AbstractLane],
     seen: Sequence[Inspected],
     fit: Callable[[Sequence[AbstractLane], AbstractCircuit], Fit],
     driver: AbstractFeed,
     candidates: Sequence[AbstractCircuit],
-) -> Tried:
-    """`repeated` for recordings with a known driver; each time the circuit is chosen anew.
+) -> CandidateFits:
+    """`refitted` for recordings with a known driver; each time the circuit is chosen anew.
 
     Args:
         lanes: Lanes of the recordings.
@@ -376,65 +300,59 @@ def refined(
         candidates: Circuits to choose from.
     """
 
-    def searched(lanes: Sequence[AbstractLane]) -> Tried:
+    def searched(lanes: Sequence[AbstractLane]) -> CandidateFits:
         if len(candidates) == 1:
-            return Tried(fit(lanes, candidates[0]))
+            return CandidateFits(fit(lanes, candidates[0]))
 
         def rows(number: int, rows: Sequence[int]) -> list[Fit]:
             return unstacked(fit([lanes[row] for row in rows], candidates[number]))
 
         found = search(len(lanes), candidates, rows)
         several = {row: fits for row, fits in enumerate(found) if len(fits) > 1}
-        return Tried(stacked([fits[0] for fits in found]), several)
+        return CandidateFits(stacked([fits[0] for fits in found]), several)
 
-    def late_by(lanes: Sequence[AbstractLane], found: Tried) -> dict[int, Lags]:
+    def late_by(lanes: Sequence[AbstractLane], found: CandidateFits) -> dict[int, Lags]:
         late = {}
         for row in found.where(lambda fit: np.asarray(fit.verdict) == "misfit"):
             circuit = found[row][found.chosen(row)].circuit
             late[row] = lanes[row].late_by(circuit, driver)
         return {row: by for row, by in late.items() if any(by)}
 
-    def of_all(first: dict[int, Fit], second: dict[int, Fit]) -> dict[int, Fit]:
+    def better(first: dict[int, Fit], second: dict[int, Fit]) -> dict[int, Fit]:
         other = second[_chosen(second)]
-        if of_both(first[_chosen(first)], other) is other:
+        if better_of(first[_chosen(first)], other) is other:
             return second
-        return {number: without_hum(fit) for number, fit in first.items()}
+        return {number: _without_hum(fit) for number, fit in first.items()}
 
-    def need_another(found: Tried) -> list[int]:
-        return found.where(needs_another)
-
-    return repeated(lanes, seen, searched, late_by, need_another, of_all)
+    return refitted(lanes, seen, searched, late_by, lambda found: found.where(may_hum), better)
 
 
-def needs_another(fit: Fit | Driver) -> Bool[np.ndarray, "*lane"]:
+def may_hum(fit: Fit | Driver) -> Bool[np.ndarray, "*lane"]:
     """Whether a fit shows hum, or misses the recording for any reason."""
     hum = (np.asarray(fit.remarks) & Remark.mains_hum) > 0
     return np.asarray(hum | ~(np.asarray(fit.chi2) < MISFIT_CHI2))
 
 
-def of_both(first: _Outcome, second: _Outcome) -> _Outcome:
+def better_of(first: _Outcome, second: _Outcome) -> _Outcome:
     """The second fit if it is successful and shows hum, else the first fit without that remark.
 
     The second fit is the one without the mains harmonics.
     """
     if second.verdict == "successful" and int(second.remarks) & Remark.mains_hum:
         return second
-    return without_hum(first)
+    return _without_hum(first)
 
 
-def without_hum(found: _Outcome) -> _Outcome:
-    """A fit or driver without the remark `mains_hum`."""
+def _without_hum(found: _Outcome) -> _Outcome:
     return dataclasses.replace(found, remarks=np.asarray(found.remarks & ~int(Remark.mains_hum)))
 
 
-def _chosen(fits: dict[int, Fit]) -> int:
-    """Number of the candidate to choose; without a choice, no reader needs to know how it goes."""
-    return best(fits) if len(fits) > 1 else next(iter(fits))
-
-
 def judged(
-    found: Tried, driver: AbstractFeed, seen: Sequence[Inspected], estimator: AbstractEstimator
-) -> Tried:
+    found: CandidateFits,
+    driver: AbstractFeed,
+    seen: Sequence[Inspected],
+    estimator: AbstractEstimator,
+) -> CandidateFits:
     """Fits with remarks, and with changes during the records; see `concluded`.
 
     A current that is used beside the driver shows smaller changes of the load than the driver does,
@@ -480,17 +398,11 @@ def concluded(
     )
 
 
-def note(fit: Fit) -> str:
-    """The message of the verdict of a fit; also the changes, elements outside, another circuit."""
-    own = {"changed": fit.changes, "out_of_bounds": fit.outside}.get(fit.verdict, "")
-    return " ".join(filter(None, (fit.other_circuit, message(fit.verdict), own)))
-
-
 def notes_of(fits: Fit) -> list[str]:
-    """`note` of each of several fits."""
+    """The note of each of several fits."""
     names = fits.verdict.tolist()
     return [
-        note(taken(fits, row)) if name in NOTED else message(name) for row, name in enumerate(names)
+        taken(fits, row).note if name in NOTED else message(name) for row, name in enumerate(names)
     ]
 
 
@@ -501,12 +413,51 @@ def remarks_on(seen: Inspected, estimator: AbstractEstimator) -> int:
     return int(seen.remarks | (Remark.current_unused if unused else 0))
 
 
-def checksum(seen: Inspected) -> int:
-    """Checksum that identifies an unloaded record; a part of its noise is enough."""
-    return zlib.crc32(seen.v_th[::SPARSE].tobytes())
+class Batch:
+    """Recordings that one call fits: they share a compiled function and a driver.
 
+    Attributes:
+        like: The first of them.
+        rows: Their numbers.
+        lanes: Their arrays.
+        seen: The recordings and their properties.
+    """
 
-def is_shared(seen: Inspected, driver: AbstractFeed) -> bool:
-    """Whether a recording and a calibration may share one unloaded record."""
-    known = driver.unloaded if isinstance(driver, HarmonicDriver) else None
-    return known is None or checksum(seen) in known
+    def __init__(self, like: Prepared) -> None:
+        self.like = like
+        self.rows: list[int] = []
+        self.lanes: list[AbstractLane] = []
+        self.seen: list[Inspected] = []
+        self._samples = 0
+
+    def add(self, row: int, one: Prepared) -> None:
+        """Append a recording."""
+        self.rows.append(row)
+        self.lanes.append(one.lane)
+        self.seen.append(one.seen)
+        self._samples += one.seen.recording.samples["v_out"].stored.size
+
+    @property
+    def full(self) -> bool:
+        """Whether a call has its lanes, or the recordings take much memory."""
+        return len(self.rows) == LANES or (len(self.rows) >= FEWEST and self._samples >= HELD)
+
+    def fitted(self, candidates: Sequence[AbstractCircuit], total: int) -> CandidateFits:
+        """The fits, with their verdicts.
+
+        Args:
+            candidates: Circuits to choose from.
+            total: Number of recordings that are fitted in this way, here and in other calls.
+        """
+        _, driver, estimator, first, shared = self.like
+        known = known_of(first, driver, shared, estimator)
+
+        def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
+            of = driver, known, circuit, estimator
+            if not worth_compiling(total * lanes[0].size):
+                return stacked(jax.device_get([skin(lane, *of) for lane in lanes]))
+            fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
+            return taken(fits, np.arange(len(lanes)))  # without the padding
+
+        found = refitted_loads(self.lanes, self.seen, fit, driver, candidates)
+        return judged(found, driver, self.seen, estimator)
