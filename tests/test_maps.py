@@ -55,6 +55,13 @@ def test_each_day_has_a_map_and_values_lie_at_their_electrodes(display):
     assert len(scales) == 1
 
 
+def test_plot_draws_a_map_on_given_axes(display):
+    _, axes = style.new_figure(1, 2, (6.0, 4.0))
+    assert etid.plot(display, map="r_p", axes=axes).shape == (2,)
+    with pytest.raises(TypeError, match="map is for Fits"):
+        etid.plot(display[0], map="r_p")
+
+
 @pytest.mark.parametrize(
     ("element", "layout", "message"),
     [

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import matplotlib.axes
     import matplotlib.figure
 
+    from etid.plotting.layout import Layout
     from etid.plotting.style import Canvas
 
 Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
@@ -48,13 +49,11 @@ def plot(
 def plot(x: Driver, recording: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
 @overload
 def plot(
-    x: Impedance
-    | Mapping[str, Impedance]
-    | Fits
-    | Posterior
-    | Profile
-    | Bound
-    | Mapping[str, Bound],
+    x: Fits, *, axes: AnyAxes = None, map: str | None = None, layout: "Layout | None" = None
+) -> np.ndarray: ...
+@overload
+def plot(
+    x: Impedance | Mapping[str, Impedance] | Posterior | Profile | Bound | Mapping[str, Bound],
     *,
     axes: AnyAxes = None,
 ) -> np.ndarray: ...
@@ -66,6 +65,8 @@ def plot(
     *,
     axes: AnyAxes = None,
     show: Shown = "pulse",
+    map: str | None = None,
+    layout: "Layout | None" = None,
 ) -> np.ndarray:
     """Draw a recording, a fit, a posterior, a driver, an impedance, fits, bounds and others.
 
@@ -86,6 +87,7 @@ def plot(
     | `plot(posterior)` | each element, and each two of them, beside the errors of the fit | n² |
     | `plot(profile)` | how much worse the fit becomes if one element has another value | 1 |
     | `plot(fits)` | each element by subject, conditions side by side | one per element |
+    | `plot(fits, map="r_p")` | an element at each electrode of a display | one per group |
     | `plot(etid.bound(scene))` | smallest relative standard errors [%] of each recording | 1 |
 
     The band around the residual of a pulse is ±2σ of the noise of both records, σ² = σ_out² +
@@ -107,6 +109,9 @@ def plot(
             `identify_skin` knows its recording and its driver; one of several fits does not.
         driver: Driver of the fit or selection, if `recording` is given.
         show: What to draw of a fit: `"pulse"`, `"impedance"` or `"residual"`.
+        map: Element to draw at each electrode of a display, a map for each subject, session, site
+            and condition. An electrode without a successful trial has a mark for its verdict.
+        layout: Places of the electrodes; if not given, `E1` to `E98` of the paper's display.
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
 
@@ -120,7 +125,14 @@ def plot(
     from etid.plotting import style
 
     canvas = style.on_pyplot if axes is None else style.on_axes(axes)
-    return _draw(canvas, x, recording, driver, show)
+    if map is None and layout is None:
+        return _draw(canvas, x, recording, driver, show)
+    from etid.plotting import maps
+    from etid.plotting.layout import FINGERTIP
+
+    if not isinstance(x, Fits) or map is None:
+        raise TypeError("map is for Fits, and layout for a map: plot(fits, map='r_p')")
+    return maps.draw_map(canvas, x, map, layout or FINGERTIP)
 
 
 def figure_of(
