@@ -32,11 +32,7 @@ from etid.commands import DONE, INTERRUPTED, WRONG_DATA, Outcome
 # Names of the commands, their modules and what they do. The modules import JAX, which takes most of
 # a second: only that of the command which is asked for is imported.
 COMMANDS = {
-    "import": (
-        "importing",
-        "convert laboratory files (.csv, .mat, .tdms, .abf, .npz, .wav, .lvm, .xlsx), or a folder "
-        "of them, to an etid file",
-    ),
+    "import": ("importing", "convert laboratory files, or a folder of them, to an etid file"),
     "calibrate": ("calibrate", "identify a driver, and say what it is worth"),
     "check": ("check", "list the faults of a file of recordings, field by field"),
     "fit": ("fit", "identify the drivers and the loads of a file of recordings"),

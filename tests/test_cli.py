@@ -358,6 +358,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(run, stud
         "simulate": ("paper_dry", "-o", tmp_path / "made.h5"),
         "merge": (study_file, "-o", tmp_path / "merged.h5"),
         "check": (study_file,),
+        "calibrate": (study_file, "-o", tmp_path / "driver.h5"),
         "import": (table, "-o", tmp_path / "i.h5", *names, *rates),
         "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
         "report": (tmp_path / "f.h5",),

@@ -44,8 +44,9 @@ def test_each_day_has_a_map_and_values_lie_at_their_electrodes(display):
         rows = [3 * day, 3 * day + 1]
         places = FINGERTIP.place(display.labels["electrode"][rows])
         expected = 1e3 * np.column_stack([FINGERTIP.x[places], FINGERTIP.y[places]])
-        np.testing.assert_allclose(dots.get_offsets(), expected)
-        np.testing.assert_allclose(dots.get_array(), 1e-3 * display.circuit.r_p[rows])
+        np.testing.assert_allclose(np.asarray(dots.get_offsets(), float), expected)
+        shown = np.asarray(dots.get_array(), float)
+        np.testing.assert_allclose(shown, 1e-3 * display.circuit.r_p[rows])
         assert f"d{day + 1}" in axis.get_title(loc="left")
         assert "2 of 3 electrodes" in axis.get_title(loc="left")
         failed = axis.lines[-1]

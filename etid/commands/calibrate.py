@@ -1,4 +1,4 @@
-"""Identify a driver while its resistor is still connected, and say what it is worth."""
+"""Identify a driver, and say what it is worth."""
 
 import argparse
 import pathlib
@@ -52,13 +52,13 @@ def run(arguments: argparse.Namespace) -> Outcome:
             file=str(arguments.source[0]),
             remedy="Import it with its resistor: etid import FILE --r-load OHM",
         )
-    former = None if arguments.former is None else read_driver(arguments.former)
-    found = calibrate(records, former=former)
+    drivers: dict[str, Driver] = {}
+    if arguments.former is not None:
+        drivers[arguments.former.stem] = read_driver(arguments.former)
+    found = calibrate(records, former=next(iter(drivers.values()), None))
     found.write(arguments.target)
     if arguments.picture is not None:
-        drivers: dict[str, Driver] = {arguments.target.stem: found.driver}
-        drivers |= {} if former is None else {arguments.former.stem: former}
-        save(figure_of(drivers), arguments.picture)
+        save(figure_of({arguments.target.stem: found.driver} | drivers), arguments.picture)
     data = {
         "source": arguments.source,
         "target": arguments.target,

@@ -157,9 +157,9 @@ def _bound(text: str) -> tuple[str, list[float | None]]:
     return name, _ends(ends, "--bound r_s=100:2000 or r_s=100:")
 
 
-def _plausible(text: str) -> list[float | None]:
+def _plausible(text: str) -> tuple[float | None, ...]:
     """The value of --plausible; the function that gets it checks the range."""
-    return _ends(text, "--plausible 300:300e3")
+    return tuple(_ends(text, "--plausible 300:300e3"))
 
 
 def _several(option: str, known: list[tuple[str, list[Any]]], count: int) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""Convert laboratory files (.csv, .mat, .tdms, .abf, .npz, .wav, .lvm, .xlsx) to an etid file."""
+"""Convert laboratory files, or a folder of them, to an etid file.
+
+The files may be .csv, .mat, .tdms, .abf, .npz, .wav, .lvm and .xlsx.
+"""
 
 import argparse
 import dataclasses

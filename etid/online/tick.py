@@ -4,6 +4,7 @@ For each electrode a tick has the verdict on the samples, the fit with the predi
 a change, a fit of the pulse alone where it is new or suspected, and the state after it.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -131,7 +132,7 @@ def updated(
     logs = LoadUnknowns.of(before.own).log_elements
     expected = _expected(model, logs, number)
     found = jax.vmap(lambda *of: _tracked(model, *of))(before, measured, expected, information)
-    suspected = jax.vmap(lambda *of: suspicion(*of, powers, limit))(before, found, information)
+    suspected = jax.vmap(partial(suspicion, common=powers, limit=limit))(before, found, information)
     running = before.pulses > 0
     wanted = (~running | suspected.jump | suspected.drift) & (measured.bad == SUCCESSFUL)
     starts = circuit_starts(model.circuit, None)
@@ -143,7 +144,7 @@ def updated(
         wanted,
         logs,
     )
-    after = jax.vmap(lambda *of: after_pulse(*of, limit, number, powers))(
+    after = jax.vmap(partial(after_pulse, limit=limit, number=number, powers=powers))(
         before, measured, information, found, fresh, suspected
     )
     counts = running & measured.steady & (measured.bad == SUCCESSFUL)

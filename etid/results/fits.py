@@ -44,14 +44,18 @@ class Fits(Overviewed, Generic[Circuit]):
 
     Attributes:
         fit: The fits, batched along one leading axis, as numpy arrays.
-        labels: `path`, `subject`, `condition`, `electrode` and `trial` of each recording, and
-            numbers that describe the recording.
+        labels: `path`, `subject`, `session`, `site`, `condition`, `electrode` and `trial` of each
+            recording, empty where not given, and numbers that describe the recording.
         notes: A sentence for each fit that is not successful; empty for the others.
     """
 
     fit: Fit[Circuit]
     labels: Mapping[str, np.ndarray]
     notes: np.ndarray
+
+    def __post_init__(self) -> None:
+        nothing = {name: np.full(len(self.notes), "", object) for name in LABELS}
+        object.__setattr__(self, "labels", nothing | dict(self.labels))
 
     @property
     def circuit(self) -> Circuit:

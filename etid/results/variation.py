@@ -222,11 +222,11 @@ class _Model:
 
         at, low = float(best[row]), 0.0
         if beyond(0.0) > 0:
-            low = float(scipy.optimize.brentq(beyond, 0.0, at, rtol=END))
+            low = scipy.optimize.root_scalar(beyond, bracket=(0.0, at), rtol=END).root
         high = max(at, 1e3 * FINE * self.spread)
         while beyond(high) < 0:
             high *= 2
-        return low, float(scipy.optimize.brentq(beyond, at, high, rtol=END))
+        return low, scipy.optimize.root_scalar(beyond, bracket=(at, high), rtol=END).root
 
 
 def _summed(matrix: np.ndarray, groups: np.ndarray) -> np.ndarray:
