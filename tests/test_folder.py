@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 import etid
+from etid.cli import main
 from etid.files.folder import import_folder, labelled, resistance
 from etid.files.importing import import_file
 from etid.files.pattern import Pattern
@@ -49,6 +50,21 @@ def test_the_mapping_beside_the_file_imports_the_same_again(folder, tmp_path):
     mapping = import_folder(folder, first, PATTERNS, **OPTIONS).mapping
     import_file(folder, again, mapping)
     assert first.read_bytes() == again.read_bytes()
+
+
+def test_the_command_replaces_no_mapping_unasked(folder, tmp_path, capsys):
+    (tmp_path / "study.toml").write_text("mine", "utf-8")
+    words = ["import", str(folder), "-o", str(tmp_path / "study.h5"), "--labels", PATTERNS[0]]
+    assert main([*words, "--labels", PATTERNS[1]]) == 1
+    assert "study.toml: this file exists; add --force" in capsys.readouterr().err
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in OPTIONS.items()]
+    assert main([*words, "--labels", PATTERNS[1], *options, "--force"]) == 0
+    assert "left out, matches no pattern: notes.txt" in capsys.readouterr().out
+
+
+def test_a_folder_needs_labels(folder, tmp_path, capsys):
+    assert main(["import", str(folder), "-o", str(tmp_path / "study.h5")]) == 1
+    assert "Name the labels of its files, as in --labels" in capsys.readouterr().err
 
 
 def test_a_table_names_resistors_of_files_whose_names_do_not(folder):

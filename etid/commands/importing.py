@@ -91,8 +91,9 @@ def _option(
 
 
 def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
-    """The file of recordings."""
-    return {arguments.target: HDF5}
+    """The file of recordings, and the mapping of a folder."""
+    mapping = {arguments.target.with_suffix(".toml"): (".toml",)} if arguments.labels else {}
+    return {arguments.target: HDF5, **mapping}
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
