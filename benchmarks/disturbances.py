@@ -44,30 +44,19 @@ class Offset:
 
 @dataclasses.dataclass(frozen=True)
 class Spike:
-    """Half a sine at a random place in one of the periods, as when a hand moves."""
+    """Half a sine at a random place in one of the periods, as when a hand moves; or a rectangle."""
 
     height: float  # at the converter [V]
     width: float  # from its begin to its end [s]
+    rectangular: bool = False
 
     def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
         """Volts at these times [s]."""
         begin = rng.uniform(0.0, time[-1] - self.width)
         place = (time - begin) / self.width
         inside = (place > 0) & (place < 1)
-        return np.where(inside, self.height * np.sin(np.pi * np.clip(place, 0, 1)), 0.0)
-
-
-@dataclasses.dataclass(frozen=True)
-class Jump:
-    """A constant voltage for some time, at a random place."""
-
-    height: float  # at the converter [V]
-    width: float  # from its begin to its end [s]
-
-    def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
-        """Volts at these times [s]."""
-        begin = rng.uniform(0.0, time[-1] - self.width)
-        return self.height * ((time >= begin) & (time < begin + self.width))
+        shape = 1.0 if self.rectangular else np.sin(np.pi * np.clip(place, 0, 1))
+        return np.where(inside, self.height * shape, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import scipy.stats
 
 from benchmarks import visibility
-from benchmarks.disturbances import Hum, Jump, Offset, Spike
+from benchmarks.disturbances import Hum, Offset, Spike
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import (
@@ -83,8 +83,8 @@ NUISANCES: Mapping[str, Change] = {
     "spike_1V_0.1ms_out": trials(out(added=(Spike(1.0, 1e-4),))),
     "spike_1V_5ms_out_six_periods": longer(trials(out(added=(Spike(1.0, 5e-3),)))),
     "spike_0.1V_5ms_th_six_periods": longer(trials(th(added=(Spike(0.1, 5e-3),)))),
-    "jump_0.5V_5ms_out": trials(out(added=(Jump(0.5, 5e-3),))),
-    "jump_1V_5ms_out": trials(out(added=(Jump(1.0, 5e-3),))),
+    "jump_0.5V_5ms_out": trials(out(added=(Spike(0.5, 5e-3, rectangular=True),))),
+    "jump_1V_5ms_out": trials(out(added=(Spike(1.0, 5e-3, rectangular=True),))),
     "tail_5mV_5ms": all_records(tail(5e-3, 5e-3)),
     "tail_5mV_5ms_skin": trials(tail(5e-3, 5e-3)),
     "crosstalk_1%_neighbour": trials(crosstalk(4e-3)),

@@ -6,12 +6,9 @@ import pathlib
 from etid.commands import Outcome
 from etid.plotting import figure_of
 from etid.plotting.style import save
-from etid.recordings.errors import RecordingError
-from etid.recordings.hdf5 import read
-from etid.recordings.recording import Recording
 from etid.recordings.replacing import HDF5
 from etid.results.driver import Driver
-from etid.simulation.calibration import calibrate, read_driver
+from etid.simulation.calibration import calibrate, calibrations_in, read_driver
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,16 +39,7 @@ def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Identify the driver, write its calibrations, and return what it is worth."""
-    records: list[Recording] = []
-    for path in arguments.source:
-        with read(path) as study:
-            records += [study[name] for name in study.calibrations]
-    if not records:
-        raise RecordingError(
-            "holds no recording with a known resistor",
-            file=str(arguments.source[0]),
-            remedy="Import it with its resistor: etid import FILE --r-load OHM",
-        )
+    records = calibrations_in(arguments.source)
     drivers: dict[str, Driver] = {}
     if arguments.former is not None:
         drivers[arguments.former.stem] = read_driver(arguments.former)

@@ -125,14 +125,7 @@ def plot(
     from etid.plotting import style
 
     canvas = style.on_pyplot if axes is None else style.on_axes(axes)
-    if map is None and layout is None:
-        return _draw(canvas, x, recording, driver, show)
-    from etid.plotting import maps
-    from etid.plotting.layout import FINGERTIP
-
-    if not isinstance(x, Fits) or map is None:
-        raise TypeError("map is for Fits, and layout for a map: plot(fits, map='r_p')")
-    return maps.draw_map(canvas, x, map, layout or FINGERTIP)
+    return _draw(canvas, x, recording, driver, show, map, layout)
 
 
 def figure_of(
@@ -140,28 +133,40 @@ def figure_of(
     recording: Recording | None = None,
     driver: Driver | None = None,
     show: Shown = "pulse",
+    map: str | None = None,
+    layout: "Layout | None" = None,
 ) -> "matplotlib.figure.Figure":
     """The picture of `plot`, on a figure outside of `matplotlib.pyplot`; same arguments."""
     from etid.plotting import style
 
-    def canvas(*layout: Any, **options: Any) -> np.ndarray:
-        return style.new_figure(*layout, **options)[1]
+    def canvas(*grid: Any, **options: Any) -> np.ndarray:
+        return style.new_figure(*grid, **options)[1]
 
-    return _draw(canvas, x, recording, driver, show)[0].figure
+    return _draw(canvas, x, recording, driver, show, map, layout)[0].figure
 
 
 @np.errstate(all="ignore")  # a fit that failed may hold any number
 def _draw(
-    canvas: "Canvas", x: Any, recording: Recording | None, driver: Driver | None, show: Shown
+    canvas: "Canvas",
+    x: Any,
+    recording: Recording | None,
+    driver: Driver | None,
+    show: Shown,
+    element: str | None,
+    layout: "Layout | None",
 ) -> np.ndarray:
     import matplotlib as mpl
 
-    from etid.plotting import elements, impedances, judging, pulses, style
+    from etid.plotting import elements, impedances, judging, maps, pulses, style
+    from etid.plotting.layout import FINGERTIP
 
     if show not in get_args(Shown) or (show != "pulse" and not isinstance(x, Fit)):
         raise ValueError(
             f"show is {show!r}; it is for fits, and one of {', '.join(map(repr, get_args(Shown)))}"
         )
+    is_map = element is not None or layout is not None
+    if is_map and (element is None or not isinstance(x, Fits)):
+        raise TypeError("map is for Fits, and layout for a map: plot(fits, map='r_p')")
     if isinstance(x, Fit):
         recording, driver = x.source_or_own(recording, driver)
         if recording is None and x.measured is not None and show == "residual":
@@ -194,6 +199,8 @@ def _draw(
                 )
             case Recording(), None, None:
                 return pulses.draw_recording(canvas, x)
+            case Fits(), None, None if element is not None:
+                return maps.draw_map(canvas, x, element, layout or FINGERTIP)
             case Fits(), None, None:
                 return elements.draw_fits(canvas, x)
             case Posterior(), None, None:

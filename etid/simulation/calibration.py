@@ -126,16 +126,20 @@ def calibrate(
     records = [calibrations] if isinstance(calibrations, Recording) else list(calibrations)
     driver = identify_driver(records, order=order)
     noise = [float(Inspected(one).sigma[1]) for one in records]
-    now = {name: _skin(records[0], driver, skin) for name, skin in SKINS.items()}
+    trials = {name: imitated(records[0], driver, skin, 0) for name, skin in SKINS.items()}
+    now = {name: _fitted(trial, driver) for name, trial in trials.items()}
     expected = {name: {NOW: _errors(fit), MORE: _errors(fit, LONGER)} for name, fit in now.items()}
     r = _further(driver, [one.r_load or 0.0 for one in records])
     found = _with_resistor(records, driver, r)
     for name, skin in SKINS.items():
         if found is not None:
-            errors = _errors(_skin(records[0], found, skin))
+            errors = _errors(_fitted(imitated(records[0], found, skin, 0), found))
             expected[name][f"also with {r / 1e3:g} kΩ"] = errors
     known = CheckedCalibration(driver, records, noise, expected)
-    return known if former is None else _compared(known, former)
+    if former is None:
+        return known
+    shifts = {name: _shift(now[name], _fitted(trial, former)) for name, trial in trials.items()}
+    return _compared(dataclasses.replace(known, shifts=shifts), former)
 
 
 def read_driver(path: str | os.PathLike[str], *, order: Order = AUTO) -> Driver:
@@ -149,11 +153,26 @@ def read_driver(path: str | os.PathLike[str], *, order: Order = AUTO) -> Driver:
         RecordingError: The file cannot be read, or has no calibrations.
         IdentificationError: The calibrations give no driver.
     """
-    with read(path) as study:
-        records = [study[name] for name in study.calibrations]
+    return identify_driver(calibrations_in([path]), order=order)
+
+
+def calibrations_in(paths: Sequence[str | os.PathLike[str]]) -> list[Recording]:
+    """The recordings with known resistors of some files.
+
+    Raises:
+        RecordingError: A file cannot be read, or none has such a recording.
+    """
+    records: list[Recording] = []
+    for path in paths:
+        with read(path) as study:
+            records += study.calibrations.recordings()
     if not records:
-        raise RecordingError("has no calibration", file=os.fspath(path))
-    return identify_driver(records, order=order)
+        raise RecordingError(
+            "holds no recording with a known resistor",
+            file=os.fspath(paths[0]),
+            remedy="Import it with its resistor: etid import FILE --r-load OHM",
+        )
+    return records
 
 
 def imitated(recording: Recording, driver: Driver, load: SkinRC | Resistor, seed: int) -> Recording:
@@ -175,8 +194,14 @@ def imitated(recording: Recording, driver: Driver, load: SkinRC | Resistor, seed
     )
 
 
-def _skin(recording: Recording, driver: Driver, skin: SkinRC) -> Fit:
-    return identify_skin(imitated(recording, driver, skin, 0), driver, throw=False)
+def _fitted(recording: Recording, driver: Driver) -> Fit:
+    return identify_skin(recording, driver, throw=False)
+
+
+def _shift(fit: Fit, other: Fit) -> dict[str, float]:
+    """Relative differences of the elements of another fit."""
+    ratio = np.asarray(other.circuit.values()) / np.asarray(fit.circuit.values())
+    return dict(zip(fit.circuit.names(), (ratio - 1).tolist(), strict=True))
 
 
 def _errors(fit: Fit, periods: float = 1.0) -> dict[str, float]:
@@ -208,7 +233,7 @@ def _with_resistor(records: Sequence[Recording], driver: Driver, r: float) -> Dr
 
 
 def _compared(of: CheckedCalibration, former: Driver) -> CheckedCalibration:
-    """The calibration beside a former driver."""
+    """How far |Z_th| is from that of a former driver, and which resistor would explain it."""
     f = jax.device_put(BAND)
     (z, of_z), (old, of_old) = (
         (np.log(np.abs(np.asarray(one.response(f)))), np.asarray(one.log_response_stderr(f))[0])
@@ -219,17 +244,8 @@ def _compared(of: CheckedCalibration, former: Driver) -> CheckedCalibration:
     ratio = float(np.average(z - old, weights=1 / spread**2))
     rest = float(np.max(np.abs(z - old - ratio) / spread))
     r_load = of.recordings[0].r_load or float("nan")
-    shifts = {}
-    for name, skin in SKINS.items():
-        record = imitated(of.recordings[0], of.driver, skin, 0)
-        new, with_old = (
-            np.asarray(identify_skin(record, one, throw=False).circuit.values())
-            for one in (of.driver, former)
-        )
-        shifts[name] = dict(zip(skin.names(), (with_old / new - 1).tolist(), strict=True))
     return dataclasses.replace(
         of,
         moved=moved,
-        shifts=shifts,
         r_load=r_load / np.exp(ratio) if rest < MOVED else None,
     )
