@@ -25,6 +25,7 @@ CONCLUSIONS = ROOT / "tests" / "conclusions"  # what must hold after each notebo
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 SLOW = {  # compiled for minutes, or with a profile and draws
     "circuits",
+    "control",
     "derivatives",
     "joint",
     "known_elements",
@@ -38,6 +39,7 @@ PAGES = [
     if "```python" in path.read_text(encoding="utf-8")
 ]
 LAST_PLACES = {False: 5, True: 1}  # units that may differ; True: of up to three digits
+LONG = 2e-4  # part of a number of six digits or more that may differ
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
@@ -135,8 +137,9 @@ def stale(told, printed):
         for old, new in zip(NUMBER.findall(before), NUMBER.findall(now), strict=True):
             shown, _, power = old.partition("e")
             place = 10.0 ** (int(power or 0) - len(shown.partition(".")[2]))
-            few = len(re.sub(r"\D", "", shown).lstrip("0")) <= 3
-            if abs(float(old) - float(new)) > 1.001 * LAST_PLACES[few] * place:
+            digits = len(re.sub(r"\D", "", shown).lstrip("0"))
+            size = LONG * abs(float(old)) if digits > 5 else 0.0
+            if abs(float(old) - float(new)) > max(1.001 * LAST_PLACES[digits <= 3] * place, size):
                 found.append((before, now))
     return found
 
