@@ -19,7 +19,9 @@ def main(target: str) -> None:
     dry = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
     damp = etid.scenes.paper_damp(snr_db=60.0).simulate(seed=1)
     of = {"dry": dry, "damp": damp}
-    trials = [of[skin][f"typical/{skin}/{each}"] for skin, names in TRIALS.items() for each in names]
+    trials = [
+        of[skin][f"typical/{skin}/{each}"] for skin, names in TRIALS.items() for each in names
+    ]
     etid.Study.from_recordings([dry["calibration/98k8"], *trials]).write(target)
 
 
