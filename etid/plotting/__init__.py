@@ -92,8 +92,9 @@ def plot(
 
     The band around the residual of a pulse is ±2σ of the noise of both records, σ² = σ_out² +
     σ_th² mean |G|² with G = Z_L / (Z_L + Z_th). If only noise is left, 95 % of the residual lies
-    inside. The bands around impedances are two standard errors, from the covariance of the fit or
-    driver. Fits and drivers without success have a red title, and their points are hollow.
+    inside; aliases above 0.4 of the sample rate may exceed it at the edges. The bands around
+    impedances are two standard errors, from the covariance of the fit or driver. Fits and drivers
+    without success have a red title, and their points are hollow.
 
     The points of `show="impedance"` are what the recording measures in bands of frequency, with two
     standard errors. `show="residual"` adds the autocorrelation of the residual and its

@@ -200,4 +200,9 @@ def message(name: str) -> str:
             "The iteration did not converge; the fit reports the best iterate. "
             "Average more periods, or use method='output_error'."
         )
+    if name == "nonfinite":  # optimistix names no cause
+        return (
+            "inf or NaN appeared during the fit. Most likely the numbers are far from those of an "
+            "electrode: check the units and r_load, or use method='output_error'."
+        )
     return RESULTS[RESULTS._name_to_item[name]]
