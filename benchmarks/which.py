@@ -18,7 +18,7 @@ README = ROOT / "benchmarks" / "README.md"
 BEGIN, END = "<!-- python -m benchmarks which -->\n", "<!-- end -->\n"
 AS_GOOD = 1.25  # times the smallest error, that an estimator may have to be used for its speed
 WORTH = 0.5  # of the time that the first of them takes, from which on that is a reason
-ENOUGH = 12  # draws of an estimator that is recommended: the median scatters by a third
+ENOUGH = 12  # draws of an estimator that is recommended: the median scatters by a seventh
 TRUSTED = 0.5  # part of the draws that have an answer which the estimator itself stands by
 
 OPTIONS = (
