@@ -31,7 +31,7 @@ Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
 
 
 @overload
-def plot(x: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
+def plot(x: Recording, *, axes: AnyAxes = None, title: str | None = "") -> np.ndarray: ...
 @overload
 def plot(
     x: Fit,
@@ -39,23 +39,37 @@ def plot(
     driver: Driver | None = None,
     *,
     axes: AnyAxes = None,
+    title: str | None = "",
     show: Shown = "pulse",
 ) -> np.ndarray: ...
 @overload
 def plot(
-    x: Selection, recording: Recording, driver: Driver, *, axes: AnyAxes = None
+    x: Selection,
+    recording: Recording,
+    driver: Driver,
+    *,
+    axes: AnyAxes = None,
+    title: str | None = "",
 ) -> np.ndarray: ...
 @overload
-def plot(x: Driver, recording: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
+def plot(
+    x: Driver, recording: Recording, *, axes: AnyAxes = None, title: str | None = ""
+) -> np.ndarray: ...
 @overload
 def plot(
-    x: Fits, *, axes: AnyAxes = None, map: str | None = None, layout: "Layout | None" = None
+    x: Fits,
+    *,
+    axes: AnyAxes = None,
+    title: str | None = "",
+    map: str | None = None,
+    layout: "Layout | None" = None,
 ) -> np.ndarray: ...
 @overload
 def plot(
     x: Impedance | Mapping[str, Impedance] | Posterior | Profile | Bound | Mapping[str, Bound],
     *,
     axes: AnyAxes = None,
+    title: str | None = "",
 ) -> np.ndarray: ...
 @in_float64
 def plot(
@@ -64,6 +78,7 @@ def plot(
     driver: Driver | None = None,
     *,
     axes: AnyAxes = None,
+    title: str | None = "",
     show: Shown = "pulse",
     map: str | None = None,
     layout: "Layout | None" = None,
@@ -115,6 +130,7 @@ def plot(
         layout: Places of the electrodes; if not given, `E1` to `E98` of the paper's display.
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
+        title: Replaces the titles of the picture; None leaves them out, as a paper does.
 
     Returns:
         The axes of the picture, (axis,), for further changes.
@@ -126,7 +142,12 @@ def plot(
     from etid.plotting import style
 
     canvas = style.on_pyplot if axes is None else style.on_axes(axes)
-    return _draw(canvas, x, recording, driver, show, map, layout)
+    drawn = _draw(canvas, x, recording, driver, show, map, layout)
+    if title != "":
+        for axis in drawn.flat:
+            axis.set_title("", loc="left")
+        style.titled(drawn.flat[0], [title or ""])
+    return drawn
 
 
 def figure_of(

@@ -8,7 +8,7 @@ from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.circuits.display import heading, scaled
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
-from etid.plotting.style import BLUE, INK, RED, Canvas, titled
+from etid.plotting.style import BLUE, INK, RED, Canvas, titled, typeset
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
@@ -45,9 +45,9 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
         time, axis = milliseconds[part], axes[0, column]
         both = recording.cause == "v_th"
         if both:
-            axis.plot(time, recording.v_th[part], color=INK, lw=0.9, label="V_th")
+            axis.plot(time, recording.v_th[part], color=INK, lw=0.9, label=typeset("V_th"))
         style = "--" if both else "-"
-        axis.plot(time, recording.v_out[part], style, color=BLUE, lw=1.1, label="V_out")
+        axis.plot(time, recording.v_out[part], style, color=BLUE, lw=1.1, label=typeset("V_out"))
         axis.set(ylabel="voltage [V]")
         if current is not None:
             finite = current.values[np.isfinite(current.values)]
@@ -147,8 +147,12 @@ def _measured(upper: Axes, recording: Recording) -> slice:
     part = pulse(recording)
     milliseconds = 1e3 * recording.time[part]
     if recording.cause == "v_th":
-        upper.plot(milliseconds, recording.v_th[part], ":", color="0.55", lw=1.0, label="V_th")
-    upper.plot(milliseconds, recording.v_out[part], color=INK, lw=1.4, label="V_out measured")
+        upper.plot(
+            milliseconds, recording.v_th[part], ":", color="0.55", lw=1.0, label=typeset("V_th")
+        )
+    upper.plot(
+        milliseconds, recording.v_out[part], color=INK, lw=1.4, label=typeset("V_out measured")
+    )
     upper.set(ylabel="voltage [V]")
     return part
 
