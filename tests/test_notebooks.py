@@ -171,8 +171,8 @@ def test_readme_example_prints_and_draws_what_the_readme_shows(after_readme):
     _, printed, told, folder = after_readme
     assert structure(printed) == structure(told)
     assert not stale(told, printed)
-    pictures = (str(of / "fit.png") for of in (ROOT / "docs", folder))
-    assert compare_images(*pictures, TOLERANCE) is None
+    shown, drawn = str(ROOT / "docs" / "fit.png"), str(folder / "fit.png")
+    assert compare_images(shown, drawn, TOLERANCE) is None
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)

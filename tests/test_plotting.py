@@ -74,7 +74,7 @@ def test_a_current_is_shown_below_the_voltages_over_the_same_time():
     assert one.get_shared_x_axes().joined(one, one_current)
     alone = recording.without_v_th().replace(current=1e-6 * amperes)  # as of a patch clamp
     _, one, current, _ = figure_of(alone).axes
-    assert [line.get_label() for line in one.lines] == ["V_out"]
+    assert [line.get_label() for line in one.lines] == names[1:]
     assert current.get_ylabel() == "current [pA]"
 
 
