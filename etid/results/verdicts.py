@@ -66,8 +66,7 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     wrong_unit = (
         "The current, or v_out divided by it, has no size that a load at an electrode can have. "
-        "Most likely the current is in mA: give ampere and volt, and check that the two are not "
-        "exchanged."
+        "Give the current in ampere and not in mA, and v_out in volt. Or are the two exchanged?"
     )
     unconnected = (
         "v_out equals v_th within the noise: no load draws a current, or both are the same "
