@@ -99,7 +99,7 @@ def program(
 
     @functools.cache
     def compiled(processor: bool) -> Any:
-        options = None if not processor else QUICKLY if batch else AT_ONCE
+        options = {} if not processor else _known(QUICKLY if batch else AT_ONCE)
         return jax.jit(flat, static_argnums=0, compiler_options=options)
 
     @functools.wraps(function)
@@ -117,6 +117,19 @@ def program(
         return eqx.combine(found, others.of)
 
     return call
+
+
+def _known(options: dict[str, Any]) -> dict[str, Any]:
+    """Those of the options that this version of XLA has; others would end the compilation."""
+
+    def is_known(name: str) -> bool:
+        try:
+            jax.jit(lambda: 0, compiler_options={name: options[name]}).lower().compile()
+        except jax.errors.JaxRuntimeError:
+            return False
+        return True
+
+    return {name: value for name, value in options.items() if is_known(name)}
 
 
 def worth_compiling(numbers: int) -> bool:
