@@ -95,7 +95,8 @@ def program(
         return found, _Static(others)
 
     flat.__name__ = flat.__qualname__ = function.__name__
-    part = jax.jit(flat, static_argnums=0)  # of another function, which decides who runs it
+    # To run by NumPy, or as part of another function, which decides who runs it.
+    part = jax.jit(flat, static_argnums=0)
 
     @functools.cache
     def compiled(processor: bool) -> Any:
@@ -110,10 +111,13 @@ def program(
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arrays)):
             found, others = part(static, arrays)
             return eqx.combine(found, others.of)
-        run = compiled(jax.default_backend() == "cpu")
         with _at_once():
-            small = None if batch or not _by_numpy() else _in_numpy(run, static, arrays)
-            found, others = small(arrays) if small else _by_xla(run, static, arrays)
+            small = None if batch or not _by_numpy() else _in_numpy(part, static, arrays)
+            if small:
+                found, others = small(arrays)
+            else:
+                run = compiled(jax.default_backend() == "cpu")
+                found, others = _by_xla(run, static, arrays)
         return eqx.combine(found, others.of)
 
     return call
@@ -150,10 +154,10 @@ def _by_xla(run: Any, static: _Static, arrays: Any) -> Any:
         return run(static, arrays)
 
 
-def _in_numpy(run: Any, static: _Static, arrays: Any) -> Any:
-    """The compiled function as one of NumPy; None if it has a primitive that NumPy cannot run."""
+def _in_numpy(part: Any, static: _Static, arrays: Any) -> Any:
+    """The function as one of NumPy; None if it has a primitive that NumPy cannot run."""
     with unsearched():
-        traced = run.trace(static, arrays)
+        traced = part.trace(static, arrays)
         jaxpr = traced.jaxpr.jaxpr  # the same object each time, because JAX keeps its traces
         if jaxpr not in _programs:
             try:
