@@ -1,14 +1,17 @@
-"""Build wheel and sdist, and try the wheel in environments that hold nothing else.
+"""Build wheel and sdist, check them for an upload, and try the wheel in environments of its own.
 
     python .ci/wheel.py --python python3.11 python3.13 --dependencies newest oldest
 
-The oldest dependencies are the lower bounds that pyproject.toml names, exactly. An interpreter that
-this machine does not have is named, and the others are tried. Interpreters of pyenv are found with
+In each environment the README's sixty seconds are followed, too. The oldest dependencies are the
+lower bounds that pyproject.toml names, exactly. An interpreter that this machine does not have is
+named, and the others are tried. Interpreters of pyenv are found with
 PYENV_VERSION=3.11.7:3.12.1:3.13.0.
 """
 
 import argparse
 import pathlib
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -25,6 +28,7 @@ def run(*command, **options):
 def built(folder):
     """The wheel, which is built from the sdist."""
     run(sys.executable, "-m", "build", "--outdir", folder, ROOT, stdout=subprocess.DEVNULL)
+    run(sys.executable, "-m", "twine", "check", "--strict", *sorted(folder.iterdir()))
     for path in sorted(folder.iterdir()):
         print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB")
     return next(folder.glob("*.whl"))
@@ -53,6 +57,24 @@ def tried(interpreter, wheel, dependencies, folder):
     run(*install, "--only-binary", ":all:", wheel, *dependencies)
     run(python, "-m", "pip", "check", stdout=subprocess.DEVNULL)
     run(python, "-I", ROOT / ".ci" / "smoke.py", cwd=folder)
+    follow_readme(python, folder / "clone")
+
+
+def follow_readme(python, clone):
+    """The example of the README after its `pip install .`: its picture, and the words it prints."""
+    text = (ROOT / "README.md").read_text("utf-8")
+    section = text.split("## Sixty seconds\n")[1].split("\n## ")[0]
+    installed, example, told = re.findall(r"```\w*\n(.*?)```", section, re.DOTALL)
+    assert installed == "pip install .\n"
+    (clone / "data_schema").mkdir(parents=True)
+    shutil.copy(ROOT / "data_schema" / "example.h5", clone / "data_schema")
+    command = [python, "-I", "-c", example]
+    printed = subprocess.run(command, cwd=clone, check=True, capture_output=True, text=True).stdout
+    # tests/test_notebooks.py compares the digits, with the versions of constraints.txt
+    words = [re.sub(r"[\d.]+", "#", of).split() for of in (told, printed)]
+    assert words[0] == words[1], printed
+    assert (clone / "fit.png").stat().st_size > 10_000
+    print("  the README's sixty seconds: as it says")
 
 
 def main():
@@ -74,7 +96,7 @@ def main():
                 print(f"{interpreter}, {name} dependencies", flush=True)
                 try:
                     tried(interpreter, wheel, sets[name], place)
-                except subprocess.CalledProcessError as error:
+                except (subprocess.CalledProcessError, AssertionError) as error:
                     print(f"  failed: {error}")
                     failed.append(f"{interpreter} with the {name} dependencies")
     return f"the wheel fails on {', '.join(failed)}" if failed else 0

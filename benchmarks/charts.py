@@ -13,6 +13,13 @@ from etid.plotting.style import INK as INK
 from etid.plotting.style import MARKS as MARKS
 from etid.plotting.style import new_figure as new_figure
 
+# Kinds of answers, with their colours, hatches and labels.
+ANSWERS = {
+    "right": ("#8fc79a", "", "right"),
+    "refused": ("#f6d55c", "...", "right, but refused"),
+    "said": ("#f0a35e", "///", "wrong or no answer, and says so"),
+    "silent": ("#b3261e", "xxx", "wrong, called successful"),
+}
 PANEL, LINE = 2.6, 0.15  # [inch] width of a panel of shares, height of a bar
 
 

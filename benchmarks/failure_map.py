@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import Patch
 
 from benchmarks import charts
 from benchmarks.estimators import DEFAULT, ELEMENTS, OURS, Answer
@@ -50,8 +51,8 @@ USUAL = 10_000.0  # samples of three periods at 200 kHz
 CHUNK = 8  # cells of one task
 COLUMNS = 4  # of a picture
 PANEL = (3.9, 2.5)  # [inch]
-MARK = "▲"  # of silent failures
-DARK = 0.55  # rate above which print is white
+WIDE = 0.94  # part of a cell that its bar takes
+PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}  # behind a number
 BOUND = "largest bound of an element, %"  # which no method can be better than
 # Of the quick run: two where all is well for the default method and not for the others, and one
 # where another skin has to be noticed.
@@ -205,23 +206,23 @@ def in_order(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _panel(axes: Axes, rows: Rows, down: list[str], across: list[str], title: str) -> None:
-    """One method: failures in grey and in numbers, silent ones with a mark; or the bounds."""
-    shades = np.full((len(down), len(across)), 0.0 if title == BOUND else np.nan)
+    """One method: a bar of its answers in each cell, silent ones in numbers too; or the bounds."""
     for row in rows:
         i, j = down.index(row["row"]), across.index(row["column"])
         if title == BOUND:
-            texts = [(0.0, f"{100 * row['largest_bound']:.2g}", 7, "normal")]
-        else:
-            shades[i, j] = failed = row["wrong"] + row["refused"]
-            silent = row["silent"] > 0
-            texts = [(-0.22 * silent, f"{100 * failed:.0f}", 8, "normal")]
-            if silent:
-                digits = 0 if row["silent"] > 0.01 else 1
-                texts.append((0.24, f"{MARK} {100 * row['silent']:.{digits}f}", 7, "bold"))
-        for lower, text, size, weight in texts:
-            axes.text(j, i + lower, text, ha="center", va="center", fontsize=size, weight=weight,
-                      color="white" if shades[i, j] > DARK else charts.INK)  # fmt: skip
-    axes.imshow(shades, cmap="Greys", vmin=0, vmax=1, aspect="auto")
+            axes.text(j, i, f"{100 * row['largest_bound']:.2g}", ha="center", va="center", size=7)
+            continue
+        shares = shares_of(row)
+        left = j - 0.5 * WIDE
+        for kind, (colour, hatch, _) in charts.ANSWERS.items():
+            axes.barh(i, WIDE * shares[kind], 0.8, left, color=colour, hatch=hatch,
+                      edgecolor="white", linewidth=0.3)  # fmt: skip
+            left += WIDE * shares[kind]
+        if shares["silent"] > 0:
+            digits = 0 if shares["silent"] > 0.01 else 1
+            text = f"{100 * shares['silent']:.{digits}f}"
+            axes.text(j, i, text, ha="center", va="center", size=8, weight="bold", bbox=PAPER)
+    axes.set(xlim=(-0.5, len(across) - 0.5), ylim=(len(down) - 0.5, -0.5))
     axes.grid(False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0, labelsize=7)
@@ -230,22 +231,44 @@ def _panel(axes: Axes, rows: Rows, down: list[str], across: list[str], title: st
     axes.set_title(title, fontsize=9)
 
 
+def shares_of(row: Mapping[str, Any]) -> dict[str, float]:
+    """The share of each kind of answer in a cell; they add up to 1."""
+    wrong, refused, silent = (float(row[name]) for name in ("wrong", "refused", "silent"))
+    return {
+        "right": max(1 - wrong - refused, 0.0),
+        "refused": refused,
+        "said": max(wrong - silent, 0.0),
+        "silent": silent,
+    }
+
+
 def draw(rows: Rows, path: pathlib.Path) -> None:
-    """Draw one map from its rows of the table, as SVG or PNG."""
+    """Draw one map from its rows of the table, as SVG or PNG; methods that agree share a panel."""
     methods, down, across = (
         list(dict.fromkeys(row[name] for row in rows)) for name in ("method", "row", "column")
     )
-    high = -(-(len(methods) + 1) // COLUMNS)
-    size = COLUMNS * PANEL[0], high * PANEL[1] + 0.8
+    of = {m: [row for row in rows if row["method"] == m] for m in methods}
+    alike: dict[tuple[Any, ...], list[str]] = {}
+    for method in methods:
+        key = tuple((row["row"], row["column"], *shares_of(row).values()) for row in of[method])
+        alike.setdefault(key, []).append(method)
+    high = -(-(len(alike) + 1) // COLUMNS)
+    size = COLUMNS * PANEL[0], high * PANEL[1] + 1.1
     figure, axes = charts.new_figure(high, COLUMNS, size, sharey=True)
-    panels, of = list(axes.flat), {m: [row for row in rows if row["method"] == m] for m in methods}
-    for panel, method in zip(panels, methods, strict=False):
-        _panel(panel, of[method], down, across, method.replace("_", " "))
-    _panel(panels[len(methods)], of[methods[0]], down, across, BOUND)
-    for panel in panels[len(methods) + 1 :]:
+    panels = list(axes.flat)
+    for panel, same in zip(panels, alike.values(), strict=False):
+        title = ", ".join(method.replace("_", " ") for method in same)
+        _panel(panel, of[same[0]], down, across, title)
+    _panel(panels[len(alike)], of[methods[0]], down, across, BOUND)
+    for panel in panels[len(alike) + 1 :]:
         panel.set_visible(False)
-    title = f"{rows[0]['map']}: % of answers that are wrong or refused; {MARK} % that are wrong"
-    figure.suptitle(f"{title} silently", fontsize=11)
+    faces = [
+        Patch(facecolor=colour, hatch=hatch, edgecolor="white", label=label)
+        for colour, hatch, label in charts.ANSWERS.values()
+    ]
+    figure.legend(handles=faces, loc="outside lower center", ncols=len(faces), fontsize=8)
+    title = f"{rows[0]['map']}: share of the answers in each cell; numbers: % wrong silently"
+    figure.suptitle(title, fontsize=11)
     charts.save(figure, path)
 
 

@@ -54,14 +54,7 @@ TARGETS = {
     "silent": at_most(0),  # but for what no test can see
     "undisturbed recordings refused": at_most(0.02),
 }
-# Kinds of answers, with their colours, hatches and labels in the picture.
-FACES = {
-    "right": ("#8fc79a", "", "right"),
-    "refused": ("#f6d55c", "...", "right, but refused"),
-    "said": ("#f0a35e", "///", "wrong or no answer, and says so"),
-    "silent": ("#b3261e", "xxx", "wrong, called successful"),
-}
-KINDS = tuple(FACES)
+KINDS = tuple(charts.ANSWERS)
 FEW = ("base", "polarity_out", "rp_linear_0.2", "driver_Rload_wrong_5%")
 
 OPTIONS = (
@@ -224,7 +217,7 @@ def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     sorted_panels = {
         name: {row: of[row] for row in order if row in of} for name, of in panels.items()
     }
-    charts.shares(sorted_panels, FACES, path)
+    charts.shares(sorted_panels, charts.ANSWERS, path)
 
 
 def _label(name: str) -> str:

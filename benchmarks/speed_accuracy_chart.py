@@ -1,4 +1,4 @@
-"""Error against time, one panel per scene, told apart by letters rather than colours."""
+"""Error against time, one panel per scene, told apart by names rather than colours."""
 
 import pathlib
 import textwrap
@@ -15,11 +15,11 @@ from etid.estimators import registry
 # What stands in a panel for each estimator.
 LETTERS = {
     "default": "etid",
-    "maximum_likelihood": "ML",
-    "non_parametric": "NP",
-    "output_error": "OE",
-    "steiglitz_mcbride": "SM",
-    "equation_error": "EE",
+    "maximum_likelihood": "max. likelihood",
+    "non_parametric": "non-parametric",
+    "output_error": "output error",
+    "steiglitz_mcbride": "Steiglitz-McBride",
+    "equation_error": "equation error",
     "SciPy least_squares, harmonics": "SciPy",
     "SciPy least_squares, lfilter": "lfilter",
     "lmfit leastsq": "lmfit",
@@ -59,14 +59,16 @@ def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
         panel.set_ylabel("median error / Cramer-Rao bound")
     for panel in axes[-1]:
         panel.set_xlabel("time per skin [ms]")
-    key = ", ".join(f"{short(name)} {name.replace('_', ' ')}" for name in registry.names())
+    ours = [int(row["draws"]) for row in rows if row["mode"] != "rival"]
+    theirs = [int(row["draws"]) for row in rows if row["mode"] == "rival"] or ours
     figure.supxlabel(
         "\n".join(
             textwrap.wrap(
-                f"etid: the default method; {key}, left out where it is the default; open: rivals. "
-                "A line leads from one recording a call to a batch. (In brackets): says itself "
-                "that most of its answers are not good. Dashed: what nothing beats in both. Grey: "
-                "where an efficient estimator is.",
+                "Filled: etid, its default method in bold; open: rivals. A line leads from one "
+                "recording a call to a batch. (In brackets): says itself that most of its answers "
+                "are not good. Dashed: what nothing beats in both. Grey: where an efficient "
+                f"estimator is. {min(ours)} to {max(ours)} draws of each of etid's methods, "
+                f"{min(theirs)} to {max(theirs)} of each rival.",
                 150,
             )
         ),

@@ -18,6 +18,7 @@ README = ROOT / "benchmarks" / "README.md"
 BEGIN, END = "<!-- python -m benchmarks which -->\n", "<!-- end -->\n"
 AS_GOOD = 1.25  # times the smallest error, that an estimator may have to be used for its speed
 WORTH = 0.5  # of the time that the first of them takes, from which on that is a reason
+ENOUGH = 12  # draws of an estimator that is recommended: the median scatters by a seventh
 TRUSTED = 0.5  # part of the draws that have an answer which the estimator itself stands by
 
 OPTIONS = (
@@ -31,7 +32,7 @@ def read(path: pathlib.Path) -> list[dict[str, Any]]:
     """Rows of our estimators, with numbers as numbers."""
     with path.open() as file:
         rows = [row for row in csv.DictReader(file) if row["mode"] != "rival"]
-    numbers = ("error", "none", "said", "wrong", "silent", "ms")
+    numbers = ("draws", "error", "none", "said", "wrong", "silent", "ms")
     return [{**row, **{name: float(row[name]) for name in numbers}} for row in rows]
 
 
@@ -49,6 +50,7 @@ def table(rows: Sequence[Row]) -> str:
         lines.append(f"| {scene} | " + " | ".join(cells) + f" | {name} |")
     times = [_median_ms(of_method[name]) for name in methods]
     lines.append("| *ms, in a batch* | " + " | ".join(times) + " | |")
+    lines.append("| *draws* | " + " | ".join(_draws(of_method[name]) for name in methods) + " | |")
     return "\n".join(lines) + "\n"
 
 
@@ -58,7 +60,7 @@ def best(rows: Sequence[Row]) -> str | None:
         row
         for row in sorted(rows, key=lambda row: OURS.index(row["estimator"]))
         if row["estimator"] in names() and row["silent"] == 0 and np.isfinite(row["error"])
-        if _is_trusted(row)
+        if _is_trusted(row) and row["draws"] >= ENOUGH
     ]
     if not trusted:
         return None
@@ -84,6 +86,11 @@ def _cell(row: Row | None, used: bool) -> str:
 def _median_ms(rows: Sequence[Row]) -> str:
     found = [row["ms"] for row in rows if row["mode"] == "batched" and np.isfinite(row["ms"])]
     return f"{np.median(found):.3g}" if found else "-"
+
+
+def _draws(rows: Sequence[Row]) -> str:
+    least, most = (int(end(row["draws"] for row in rows)) for end in (min, max))
+    return f"{least}" if least == most else f"{least} to {most}"
 
 
 def inserted(text: str, made: str) -> str:

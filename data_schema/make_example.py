@@ -1,12 +1,13 @@
-"""Make example.h5: one calibration and three trials of a dry fingertip, one pulse period each.
+"""Make example.h5, the recordings of the start page: a known resistor, dry skin and damp skin.
 
 python data_schema/make_example.py data_schema/example.h5
 """
 
 import sys
 
-from etid.simulation import scenes
-from etid.simulation.transformer import ResistorLoad, SkinLoad
+import etid
+
+TRIALS = {"dry": ("01", "02", "03"), "damp": ("01", "02")}
 
 
 def main(target: str) -> None:
@@ -15,17 +16,13 @@ def main(target: str) -> None:
     Args:
         target: The file.
     """
-    dry = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
-    scene = scenes.Scene(
-        trials=tuple(
-            scenes.Trial(f"s01/dry/{i}", dry, subject="s01", condition="dry", trial=f"{i}")
-            for i in range(3)
-        ),
-        calibration=(scenes.Trial("calibration/98k8", ResistorLoad(98.8e3)),),
-        samples=3333,
-        snr_db=70.0,
-    )
-    scene.simulate(seed=0).write(target)
+    dry = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
+    damp = etid.scenes.paper_damp(snr_db=60.0).simulate(seed=1)
+    of = {"dry": dry, "damp": damp}
+    trials = [
+        of[skin][f"typical/{skin}/{each}"] for skin, names in TRIALS.items() for each in names
+    ]
+    etid.Study.from_recordings([dry["calibration/98k8"], *trials]).write(target)
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ study.h5                     schema="etid/recording", schema_version="1.0"
 {EXAMPLE}```
 
 `etid check study.h5` lists the faults of each field of a file. `example.h5` contains a calibration
-and a stack of three trials. `python data_schema/make_example.py data_schema/example.h5` made it.
+and five trials. `python data_schema/make_example.py data_schema/example.h5` made it.
 """
 
 _RULES = """\

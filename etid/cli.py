@@ -176,7 +176,10 @@ class _Completion(argparse.Action):
         try:
             import shtab
         except ImportError:
-            parser.error("--completion needs shtab: pip install 'etid[completion]'")
+            parser.error(
+                "--completion needs shtab: pip install 'etid[completion]' "
+                "(in a clone: '.[completion]')"
+            )
         _complete_paths(parser, shtab.FILE)
         print(shtab.complete(parser, shell))
         parser.exit()

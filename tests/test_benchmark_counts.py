@@ -323,7 +323,7 @@ def test_what_beats_the_default_is_faster_and_better_beyond_chance():
 
 def row(name, **of):
     defaults = {"scene": "s", "mode": "batched", "beaten_by": "", "silent": 0.0, "error": 1.0}
-    more = {"ms": 1.0, "said": 0.0, "none": 0.0, "on_front": False, "missing": ""}
+    more = {"draws": 24.0, "ms": 1.0, "said": 0.0, "none": 0.0, "on_front": False, "missing": ""}
     return {**defaults, **more, "estimator": name, **of}
 
 
@@ -344,6 +344,7 @@ def test_the_first_that_is_good_is_to_be_used_or_what_is_as_good_in_half_its_tim
     ]
     assert which.best(rows) == "non_parametric"
     assert which.best([rows[0], {**rows[1], "ms": 2.0}]) == "maximum_likelihood"
+    assert which.best([rows[0], {**rows[1], "draws": 5.0}]) == "maximum_likelihood"
     assert which.best(rows[3:]) is None
     made = which.table(rows)
     assert "| s | 1 | **1.2** | 1.3 | (0.9) | 0.9 silent | non parametric |" in made

@@ -5,15 +5,18 @@ import io
 import json
 import pathlib
 import re
+import shutil
 import sys
 import time
 import warnings
 
 import nbformat
 import pytest
+from matplotlib.testing.compare import compare_images
 
 from etid.numpy_tier.tiers import COMPILING
 from tests.conftest import REFERENCE_DATA
+from tests.test_plotting import TOLERANCE
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
@@ -22,6 +25,7 @@ CONCLUSIONS = ROOT / "tests" / "conclusions"  # what must hold after each notebo
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 SLOW = {  # compiled for minutes, or with a profile and draws
     "circuits",
+    "control",
     "derivatives",
     "joint",
     "known_elements",
@@ -34,7 +38,8 @@ PAGES = [
     for path in sorted((ROOT / "docs").glob("*.md"))
     if "```python" in path.read_text(encoding="utf-8")
 ]
-LAST_PLACES = 5
+LAST_PLACES = {False: 5, True: 1}  # units that may differ; True: of up to three digits
+LONG = 2e-4  # part of a number of six digits or more that may differ
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
@@ -130,9 +135,11 @@ def stale(told, printed):
     for before, now in zip(told.strip().splitlines(), printed.strip().splitlines(), strict=True):
         before, now = (re.sub(r"\d+ steps|[\d.]+ m?s\b", "", line) for line in (before, now))
         for old, new in zip(NUMBER.findall(before), NUMBER.findall(now), strict=True):
-            digits = old.partition("e")[0].partition(".")[2]
-            place = 10.0 ** (int(old.partition("e")[2] or 0) - len(digits))
-            if abs(float(old) - float(new)) > max(LAST_PLACES * place, 0.01 * abs(float(old))):
+            shown, _, power = old.partition("e")
+            place = 10.0 ** (int(power or 0) - len(shown.partition(".")[2]))
+            digits = len(re.sub(r"\D", "", shown).lstrip("0"))
+            size = LONG * abs(float(old)) if digits > 5 else 0.0
+            if abs(float(old) - float(new)) > max(1.001 * LAST_PLACES[digits <= 3] * place, size):
                 found.append((before, now))
     return found
 
@@ -147,25 +154,30 @@ def run_page(path, names, capsys):
 
 
 @pytest.fixture(scope="module")
-def after_readme():
-    """Names that the examples of the start page have made."""
+def after_readme(tmp_path_factory):
+    """Names that the example of the start page has made, what it printed and says, its folder."""
     names: dict = {}
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
+    printed, folder = io.StringIO(), tmp_path_factory.mktemp("clone")
+    (folder / "data_schema").mkdir()
+    shutil.copy(ROOT / "data_schema" / "example.h5", folder / "data_schema")
+    with contextlib.redirect_stdout(printed), contextlib.chdir(folder):
         (code, told), *others = blocks_of(ROOT / "README.md")
         exec(compile(code, "README.md", "exec"), names)
     assert not others
-    return names, printed.getvalue(), told
+    return names, printed.getvalue(), told, folder
 
 
-def test_readme_example_prints_what_the_readme_says(after_readme):
-    _, printed, told = after_readme
+def test_readme_example_prints_and_draws_what_the_readme_shows(after_readme):
+    _, printed, told, folder = after_readme
     assert structure(printed) == structure(told)
     assert not stale(told, printed)
+    pictures = (str(of / "fit.png") for of in (ROOT / "docs", folder))
+    assert compare_images(*pictures, TOLERANCE) is None
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
 def test_examples_of_a_page_print_what_it_says(path, after_readme, tmp_path, monkeypatch, capsys):
+    shutil.copytree(after_readme[-1], tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     run_page(path, dict(after_readme[0]), capsys)
 

@@ -137,7 +137,7 @@ SHOWN = {
         fit,
         ["SkinRC: successful in 7 steps", "r_s 33.40 ± 0.10 kΩ", "c_p 0.1200 ± 0.0010 nF"],
     ),
-    "failed fit": (lambda: fit("misfit"), ["SkinRC: misfit", "misses the recording by far more"]),
+    "failed fit": (lambda: fit("misfit"), ["SkinRC: misfit", "misses the recording", "chi2 is 1"]),
     "changed fit": (changed, ["During the record: r_s +1 ± 0.1 %, r_p -20 ± 2 %"]),
     "driver with findings": (
         found_driver,

@@ -62,6 +62,19 @@ def test_citation_says_what_the_project_says(citation, project):
     ]
 
 
+def test_the_conda_recipe_says_what_the_project_says(project):
+    recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text("utf-8"))
+    assert recipe["context"]["version"] == project["version"]
+    assert f">={recipe['context']['python_min']}" == project["requires-python"]
+    assert recipe["about"]["summary"] == project["description"]
+    assert recipe["about"]["license"] == project["license"]
+    (entry,) = recipe["build"]["python"]["entry_points"]
+    assert entry == f"etid = {project['scripts']['etid']}"
+    named = {"matplotlib-base": "matplotlib"}  # what conda-forge calls it without Qt
+    needed = [one.partition(" ") for one in recipe["requirements"]["run"][1:]]
+    assert [named.get(name, name) + bound for name, _, bound in needed] == project["dependencies"]
+
+
 def test_types_are_shipped(project):
     assert (ROOT / "etid" / "py.typed").is_file()
     assert "Typing :: Typed" in project["classifiers"]

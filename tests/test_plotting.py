@@ -66,7 +66,8 @@ def test_a_current_is_shown_below_the_voltages_over_the_same_time():
     recording = pictures.with_current()
     amperes = recording.samples["current"].values
     voltage, one, current, one_current = figure_of(recording).axes
-    assert [line.get_label() for line in one.lines] == ["V_th", "V_out"]
+    names = [r"$V_\mathrm{th}$", r"$V_\mathrm{out}$"]
+    assert [line.get_label() for line in one.lines] == names
     assert current.get_ylabel() == one_current.get_ylabel() == "current [mA]"
     np.testing.assert_allclose(np.asarray(current.lines[0].get_ydata()), 1e3 * amperes)
     assert voltage.get_shared_x_axes().joined(voltage, current)
@@ -120,7 +121,10 @@ def test_a_fit_shows_its_residual_in_millivolts_in_a_band_of_two_sigma(recording
     np.testing.assert_allclose((bottom, height), (-2e3 * sigma, 4e3 * sigma))
     title = upper.get_title(loc="left")
     assert "successful" in title
-    assert "r_s 33.40 ± 0.67 kΩ" in title
+    assert r"$R_\mathrm{s}$ 33.40 ± 0.67 kΩ" in title
+    for given, shown in ((None, ""), ("dry", "dry")):
+        drawn = etid.plot(fit, recording, driver, title=given)
+        assert [axis.get_title(loc="left") for axis in drawn] == [shown, ""]
 
 
 def test_the_band_is_that_of_the_noise_of_both_records(driver):

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import etid
@@ -172,6 +173,11 @@ def test_names_and_values_are_inverse():
 @pytest.mark.parametrize("name", sorted(RESULTS._name_to_item))
 def test_every_failure_says_what_it_is(name):
     assert (name == "successful") == (message(name) == "")
+
+
+def test_a_verdict_is_said_in_forty_words():
+    own = set(vars(RESULTS)["_name_to_item"]) - set(vars(optx.RESULTS)["_name_to_item"])
+    assert {name for name in own if len(message(name).split()) > 40} == set()
 
 
 def test_a_note_beyond_the_message_of_its_verdict():

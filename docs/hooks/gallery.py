@@ -48,9 +48,10 @@ def _execute(text):
 def on_config(config):
     """Add the notebooks to the navigation, below the gallery."""
     pages = [f"notebooks/{path.stem}.md" for path in _notebooks()]
-    for entry in config.nav:
-        if entry == {"Notebooks": "gallery.md"}:
-            entry["Notebooks"] = ["gallery.md", *pages]
+    for group in config.nav:
+        for entry in next(iter(group.values())):
+            if entry == {"Notebooks": "gallery.md"}:
+                entry["Notebooks"] = ["gallery.md", *pages]
     return config
 
 

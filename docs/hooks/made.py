@@ -47,15 +47,36 @@ def commands():
     return "\n\n".join(f"### {name}\n\n```text\n{text}```" for name, text in helps.items())
 
 
+# What one does with a name, by the package that has it.
+TASKS = {
+    "Read, import and export recordings": ("recordings", "files"),
+    "Identify": ("identify", "selection"),
+    "Use the results": ("results",),
+    "Show and share": ("plotting", "report"),
+    "Simulate and plan": ("simulation",),
+    "Follow a display": ("online",),
+    "Circuits": ("circuits",),
+    "Methods": ("estimators",),
+}
+
+
 def reference():
-    """Reference of all names that `etid` exports."""
-    names = sorted(etid.__all__, key=str.lower)
-    groups = {"Functions": types.FunctionType, "Classes": type, "Modules": types.ModuleType}
+    """Reference of all names that `etid` exports, by task."""
+    names = sorted(set(etid.__all__) - {"__version__"}, key=str.lower)
+    of = {name: _package(getattr(etid, name)) for name in names}
+    missing = {name for name, package in of.items() if package not in sum(TASKS.values(), ())}
+    assert not missing, f"no task has {missing}"
     parts = []
-    for heading, kind in groups.items():
+    for heading, packages in TASKS.items():
         parts.append(f"## {heading}")
-        parts += [f"::: etid.{name}" for name in names if isinstance(getattr(etid, name), kind)]
+        parts += [f"::: etid.{name}" for name, package in of.items() if package in packages]
     return "\n\n".join(parts)
+
+
+def _package(named):
+    """The package of etid that a class, a function or a module comes from."""
+    name = named.__name__ if isinstance(named, types.ModuleType) else named.__module__
+    return name.split(".")[1]
 
 
 MADE = {"verdicts": table_of_verdicts, "commands": commands, "reference": reference}

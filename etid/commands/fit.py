@@ -264,7 +264,9 @@ def _executor(arguments: argparse.Namespace) -> Iterator[concurrent.futures.Exec
         try:
             import distributed
         except ImportError as error:
-            raise ValueError("--dask needs distributed: pip install 'etid[dask]'") from error
+            raise ValueError(
+                "--dask needs distributed: pip install 'etid[dask]' (in a clone: '.[dask]')"
+            ) from error
         with distributed.Client(arguments.dask) as client:
             yield client.get_executor()
     elif arguments.workers:

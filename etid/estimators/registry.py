@@ -1,14 +1,13 @@
 """The estimators by name; `etid.estimators.estimator` states what an estimator must provide."""
 
-import ast
 import dataclasses
-import math
 
 from etid.estimators.estimator import AbstractEstimator, Description
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.non_parametric.estimator import NonParametric
 from etid.estimators.output_error.estimator import OutputError
 from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
+from etid.results.method_options import options_of
 
 Method = str | AbstractEstimator  # a name in the registry, or an estimator with its options
 MAXIMUM_LIKELIHOOD = MaximumLikelihood()
@@ -55,26 +54,13 @@ def named(method: str) -> AbstractEstimator:
     Raises:
         ValueError: No estimator has this name, or the estimator has no such options.
     """
-    name, _, options = method.partition("(")
+    name = method.partition("(")[0]
     if name not in _ESTIMATORS:
         raise ValueError(f"method {method!r} is not known; use one of {', '.join(names())}")
-    if not options:
-        return _ESTIMATORS[name]
     try:
-        call = ast.parse(f"dict({options}", mode="eval").body
-        keywords = call.keywords if isinstance(call, ast.Call) else []
-        given = {str(one.arg): ast.literal_eval(_Infinite().visit(one.value)) for one in keywords}
-        return dataclasses.replace(_ESTIMATORS[name], **given)
-    except (SyntaxError, ValueError, TypeError, RecursionError) as error:
+        return dataclasses.replace(_ESTIMATORS[name], **options_of(method)[1])
+    except (ValueError, TypeError) as error:
         raise ValueError(f"method {method!r}: {name} has no such options") from error
-
-
-class _Infinite(ast.NodeTransformer):
-    """Reads `inf`, which is no literal of Python, as a number."""
-
-    def visit_Name(self, node: ast.Name) -> ast.expr:
-        """The number for the name `inf`; other names are left."""
-        return ast.Constant(math.inf) if node.id == "inf" else node
 
 
 def described(method: str) -> Description | None:

@@ -197,7 +197,7 @@ def optional(module: str, extra: str, file: str, package: str = "") -> Any:
         raise RecordingError(
             f"needs the package {package or module}",
             file=file,
-            remedy=f"Run pip install 'etid[{extra}]'",
+            remedy=f"Run pip install 'etid[{extra}]' (in a clone: '.[{extra}]')",
         ) from error
 
 

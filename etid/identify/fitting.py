@@ -49,7 +49,12 @@ FEWEST = 16  # recordings that are read and fitted at once, however long they ar
 HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least `FEWEST`
 SPARSE = 16  # every 16th sample enters a checksum
 KEPT = 4  # drivers, for which `known_of` is kept
-NOTED = ("changed", "out_of_bounds", "inconsistent")  # verdicts to whose message a note adds
+NOTED = (
+    "changed",
+    "misfit",
+    "out_of_bounds",
+    "inconsistent",
+)  # verdicts to whose message a note adds
 _Outcome = TypeVar("_Outcome", Fit, Driver)
 
 

@@ -31,7 +31,7 @@ Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
 
 
 @overload
-def plot(x: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
+def plot(x: Recording, *, axes: AnyAxes = None, title: str | None = "") -> np.ndarray: ...
 @overload
 def plot(
     x: Fit,
@@ -39,23 +39,37 @@ def plot(
     driver: Driver | None = None,
     *,
     axes: AnyAxes = None,
+    title: str | None = "",
     show: Shown = "pulse",
 ) -> np.ndarray: ...
 @overload
 def plot(
-    x: Selection, recording: Recording, driver: Driver, *, axes: AnyAxes = None
+    x: Selection,
+    recording: Recording,
+    driver: Driver,
+    *,
+    axes: AnyAxes = None,
+    title: str | None = "",
 ) -> np.ndarray: ...
 @overload
-def plot(x: Driver, recording: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
+def plot(
+    x: Driver, recording: Recording, *, axes: AnyAxes = None, title: str | None = ""
+) -> np.ndarray: ...
 @overload
 def plot(
-    x: Fits, *, axes: AnyAxes = None, map: str | None = None, layout: "Layout | None" = None
+    x: Fits,
+    *,
+    axes: AnyAxes = None,
+    title: str | None = "",
+    map: str | None = None,
+    layout: "Layout | None" = None,
 ) -> np.ndarray: ...
 @overload
 def plot(
     x: Impedance | Mapping[str, Impedance] | Posterior | Profile | Bound | Mapping[str, Bound],
     *,
     axes: AnyAxes = None,
+    title: str | None = "",
 ) -> np.ndarray: ...
 @in_float64
 def plot(
@@ -64,6 +78,7 @@ def plot(
     driver: Driver | None = None,
     *,
     axes: AnyAxes = None,
+    title: str | None = "",
     show: Shown = "pulse",
     map: str | None = None,
     layout: "Layout | None" = None,
@@ -92,8 +107,9 @@ def plot(
 
     The band around the residual of a pulse is ±2σ of the noise of both records, σ² = σ_out² +
     σ_th² mean |G|² with G = Z_L / (Z_L + Z_th). If only noise is left, 95 % of the residual lies
-    inside. The bands around impedances are two standard errors, from the covariance of the fit or
-    driver. Fits and drivers without success have a red title, and their points are hollow.
+    inside; aliases above 0.4 of the sample rate may exceed it at the edges. The bands around
+    impedances are two standard errors, from the covariance of the fit or driver. Fits and drivers
+    without success have a red title, and their points are hollow.
 
     The points of `show="impedance"` are what the recording measures in bands of frequency, with two
     standard errors. `show="residual"` adds the autocorrelation of the residual and its
@@ -114,6 +130,7 @@ def plot(
         layout: Places of the electrodes; if not given, `E1` to `E98` of the paper's display.
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
+        title: Replaces the titles of the picture; None leaves them out, as a paper does.
 
     Returns:
         The axes of the picture, (axis,), for further changes.
@@ -125,7 +142,12 @@ def plot(
     from etid.plotting import style
 
     canvas = style.on_pyplot if axes is None else style.on_axes(axes)
-    return _draw(canvas, x, recording, driver, show, map, layout)
+    drawn = _draw(canvas, x, recording, driver, show, map, layout)
+    if title != "":
+        for axis in drawn.flat:
+            axis.set_title("", loc="left")
+        style.titled(drawn.flat[0], [title or ""])
+    return drawn
 
 
 def figure_of(

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.numpy_tier.tiers import program
-from etid.plotting.style import COLOURS, DASHES, Canvas, plain_ticks, titled
+from etid.plotting.style import COLOURS, DASHES, Canvas, plain_ticks, titled, typeset
 from etid.results.driver import Driver, SourceImpedance
 from etid.results.fit import Fit
 from etid.solvers.matrices import log_stderr
@@ -36,7 +36,16 @@ def draw_bode(
                 failed.append(f"{label}: no success: {thing.verdict}")
             label = label if known else f"{label}, no standard error"
         colour, dash = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]
-        curve(magnitude, phase, frequency, z, label=label, color=colour, linestyle=dash, lw=1.3)
+        curve(
+            magnitude,
+            phase,
+            frequency,
+            z,
+            label=typeset(label),
+            color=colour,
+            linestyle=dash,
+            lw=1.3,
+        )
         sizes.append(np.abs(z) / 1e3)
         if known:
             banded = True

@@ -16,7 +16,7 @@ from etid.identify.predict import predict
 from etid.plotting.bands import CLEAR, Bands, bands
 from etid.plotting.impedances import POINTS, curve, frame, points
 from etid.plotting.pulses import headline
-from etid.plotting.style import BLUE, COLOURS, DASHES, INK, MARKS, RED, Canvas, titled
+from etid.plotting.style import BLUE, COLOURS, DASHES, INK, MARKS, RED, Canvas, titled, typeset
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -107,7 +107,7 @@ def draw_residual(
     cause = fed(recording, driver)[0].cause
     clean, cause_known = residual[known], recording.samples[cause].values[known]
     _correlation(own, clean, clean, "autocorrelation of the residual")
-    name = "V_th" if cause == "v_th" else "current"
+    name = typeset("V_th") if cause == "v_th" else "current"
     _correlation(with_input, clean, cause_known, f"correlation with earlier {name}")
     titled(whole, [headline(recording.path, fit)], good=fit.verdict == "successful")
     titled(own, ["band: 99 % of white noise"])

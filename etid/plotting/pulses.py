@@ -8,7 +8,7 @@ from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.circuits.display import heading, scaled
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
-from etid.plotting.style import BLUE, INK, RED, Canvas, titled
+from etid.plotting.style import BLUE, INK, RED, Canvas, titled, typeset
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
@@ -45,9 +45,9 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
         time, axis = milliseconds[part], axes[0, column]
         both = recording.cause == "v_th"
         if both:
-            axis.plot(time, recording.v_th[part], color=INK, lw=0.9, label="V_th")
+            axis.plot(time, recording.v_th[part], color=INK, lw=0.9, label=typeset("V_th"))
         style = "--" if both else "-"
-        axis.plot(time, recording.v_out[part], style, color=BLUE, lw=1.1, label="V_out")
+        axis.plot(time, recording.v_out[part], style, color=BLUE, lw=1.1, label=typeset("V_out"))
         axis.set(ylabel="voltage [V]")
         if current is not None:
             finite = current.values[np.isfinite(current.values)]
@@ -131,7 +131,9 @@ def draw_pulse(
     upper.legend(frameon=False, fontsize=8)
     sigma = 1e3 * residual_std(recording, driver, circuit)
     residual = 1e3 * (predicted - recording.v_out)
-    lower.axhspan(-2 * sigma, 2 * sigma, color="0.85", lw=0, label=r"$\pm2\,\sigma$ of the noise")
+    # Above 0.4 of the sample rate, aliases of the edges are neither noise nor predicted.
+    label = r"$\pm2\,\sigma$ of the noise (edges: aliases)"
+    lower.axhspan(-2 * sigma, 2 * sigma, color="0.85", lw=0, label=label)
     lower.axhline(0.0, color="0.6", lw=0.6)
     lower.plot(milliseconds, residual[part], color=BLUE, lw=0.8)
     lower.set(xlabel="time [ms]", ylabel="residual [mV]")
@@ -145,8 +147,12 @@ def _measured(upper: Axes, recording: Recording) -> slice:
     part = pulse(recording)
     milliseconds = 1e3 * recording.time[part]
     if recording.cause == "v_th":
-        upper.plot(milliseconds, recording.v_th[part], ":", color="0.55", lw=1.0, label="V_th")
-    upper.plot(milliseconds, recording.v_out[part], color=INK, lw=1.4, label="V_out measured")
+        upper.plot(
+            milliseconds, recording.v_th[part], ":", color="0.55", lw=1.0, label=typeset("V_th")
+        )
+    upper.plot(
+        milliseconds, recording.v_out[part], color=INK, lw=1.4, label=typeset("V_out measured")
+    )
     upper.set(ylabel="voltage [V]")
     return part
 

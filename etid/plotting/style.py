@@ -7,6 +7,7 @@ curves on a dark background.
 
 import os
 import pathlib
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -36,6 +37,11 @@ PAPER: Any = {
     "xtick.color": INK,
     "ytick.color": INK,
 }
+
+# A letter with an index, or a time constant: no part of a path or of another word.
+_SYMBOL = re.compile(
+    r"(?<![\w/.$\\])(?:[A-Za-z]_[A-Za-z0-9]{1,3}|tau(?:_\w)?|alpha(?:_\w)?)(?![\w/.])"
+)
 
 # Returns the axes of a picture, [row, column]. Its arguments are rows, columns, size [inch] and
 # options of `Figure.subplots`.
@@ -128,10 +134,15 @@ def symbol(name: str, unit: str) -> str:
     return heading(f"${letter}{subscript}$", unit)
 
 
+def typeset(text: str) -> str:
+    """A text with its symbols as formulas: `r_s 33.4 kΩ` begins with an R with the subscript s."""
+    return _SYMBOL.sub(lambda found: symbol(found[0], "1"), text)
+
+
 def titled(axis: Axes, lines: Sequence[str], *, good: bool = True) -> None:
     """Set a title on the left; red if the picture does not show a valid result."""
     color = INK if good else RED
-    axis.set_title("\n".join(filter(None, lines)), loc="left", fontsize=9, color=color)
+    axis.set_title(typeset("\n".join(filter(None, lines))), loc="left", fontsize=9, color=color)
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:

@@ -92,6 +92,7 @@ class HasSource(Generic[Circuit]):
         *,
         show: Shown = "pulse",
         axes: AnyAxes = None,
+        title: str | None = "",
     ) -> np.ndarray:
         """Draw the fit; the same as `etid.plot(fit)`.
 
@@ -102,6 +103,7 @@ class HasSource(Generic[Circuit]):
             show: `"pulse"`, `"impedance"` or `"residual"`. A fit of `identify_impedance` has only
                 the picture of its impedance.
             axes: As in `etid.plot`.
+            title: As in `etid.plot`; None leaves the titles out.
 
         Returns:
             The axes of the picture, (axis,), for further changes.
@@ -110,7 +112,7 @@ class HasSource(Generic[Circuit]):
             TypeError: The recording is not known.
         """
         drawn = _of_higher_layer("etid.plotting", "plot")
-        return drawn(self, recording, driver, show=show, axes=axes)
+        return drawn(self, recording, driver, show=show, axes=axes, title=title)
 
     def posterior(
         self,

@@ -17,6 +17,7 @@ from etid.circuits.display import quantity, several
 from etid.circuits.overview import Overview, element_rows
 from etid.recordings.remarks import texts, words
 from etid.results.data import HasSource
+from etid.results.method_options import without_known
 from etid.results.posterior import tails
 from etid.results.verdicts import RESULTS, Judged, counted, message
 from etid.signals.transfer import power
@@ -344,6 +345,16 @@ class Fit(Judged, HasSource[Circuit]):
         )
 
     @property
+    def missed(self) -> str:
+        """A sentence on the test that a `misfit` has failed, with its size; for one fit."""
+        looks = "" if self.support is None else self.support.looks_like()
+        size = f"chi2 is {float(self.chi2):.3g}; noise alone gives 1."
+        told = without_known(self.method, self.circuit.units())[1]
+        return " ".join(
+            filter(None, (looks or size, told and "Is what was told right, and in SI units?"))
+        )
+
+    @property
     def other_circuit(self) -> str:
         """A sentence if another circuit is a likelier cause of `inconsistent` than the driver."""
         if self.verdict != "inconsistent" or self.support is None:
@@ -360,7 +371,8 @@ class Fit(Judged, HasSource[Circuit]):
 
     @property
     def _reasons(self) -> list[str]:
-        own = {"changed": self.changes, "out_of_bounds": self.outside}.get(self.verdict, "")
+        said = {"changed": "changes", "misfit": "missed", "out_of_bounds": "outside"}
+        own = getattr(self, said.get(self.verdict, ""), "")
         return [*filter(None, (self.other_circuit, message(self.verdict), own))]
 
     def _overview(self) -> Overview:
@@ -370,10 +382,11 @@ class Fit(Judged, HasSource[Circuit]):
         if np.ndim(self.rrse):
             batch = f"{kind} fits, batch of {np.shape(self.rrse)}: {counted(verdict)}"
             return Overview(batch, rows)
-        title = f"{kind}: {verdict} in {several(int(self.steps), 'step')} ({self.method})"
+        method, told = without_known(self.method, self.circuit.units())
+        title = f"{kind}: {verdict} in {several(int(self.steps), 'step')} ({method})"
         title += f", RRSE {100 * float(self.rrse):.3g} %"
         if self.measured is None or self.measured.stderr is not None:
             title += f", chi2 {float(self.chi2):.3g}"  # without standard errors there is none
         outside = "" if verdict == "out_of_bounds" else self.outside
-        notes = [*self._reasons, *filter(None, [outside]), *texts(int(self.remarks))]
+        notes = [*filter(None, [told, *self._reasons, outside]), *texts(int(self.remarks))]
         return Overview(title, rows, notes=notes)

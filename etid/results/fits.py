@@ -148,7 +148,8 @@ class Fits(Overviewed, Generic[Circuit]):
         try:
             import pandas
         except ImportError as error:
-            raise ImportError("to_pandas needs pandas: pip install 'etid[table]'") from error
+            install = "pip install 'etid[table]' (in a clone: '.[table]')"
+            raise ImportError(f"to_pandas needs pandas: {install}") from error
         return pandas.DataFrame(self.table())
 
     def summary(self, *by: str) -> list[dict[str, Any]]:

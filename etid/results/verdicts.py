@@ -28,10 +28,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "Use method='output_error', or repeat the calibration with less noise."
     )
     nonphysical = (
-        "An element is negative or not a number, an exponent exceeds 1 by more than its error, or "
-        "the source impedance is not passive. "
-        "The record is too noisy for this method, or the trigger moved between the records, or "
-        "v_th, v_out and r_load do not belong together."
+        "An element is negative or not a number, an exponent exceeds 1, or the source impedance "
+        "is not passive. Most likely the record is too noisy: record more periods, and check that "
+        "v_th, v_out and r_load belong together."
     )
     insensitive = (
         "The recording does not determine a parameter: its standard error exceeds its value. "
@@ -42,13 +41,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "of a parameter exceeds its value. Use a finer range, more bits, or an amplifier."
     )
     misfit = (
-        "The prediction misses the recording by far more than its noise (chi2), or the residual "
-        "looks like one more relaxation, like a relaxation that is spread over time constants, or "
-        "like a resistance that falls with the current. "
-        "The circuit is wrong, or the trigger moved between the records, or the signal drifted or "
-        "clipped, or the method is output error and the record has mains hum. If the recording has "
-        "a current too, it may contradict the driver. If elements are fixed or have a prior, these "
-        "values may be wrong; are they in SI units?"
+        "The model misses the recording by more than its noise. Most likely it is another "
+        "circuit, or for a driver a higher order: try circuit='auto' or order='auto', and look at "
+        "the residual."
     )
     changed = (
         "The load or the driver changed during the record: the pulse periods differ by more than "
@@ -65,26 +60,23 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "Measure the resistors, and give every r_load in ohm."
     )
     implausible = (
-        "The source impedance at 1 kHz lies outside `plausible`. Is r_load in ohm? With r_load in "
-        "kohm the impedance is 1000 times too small. Was that resistor connected, and do v_th and "
-        "v_out have the same unit? If not, the impedance is too large. If the driver really is "
-        "like this, set `plausible` [ohm]."
+        "The source impedance at 1 kHz lies outside `plausible`. Most likely r_load is not in "
+        "ohm, or another load was connected: correct r_load. If the driver really is like this, "
+        "set `plausible` [ohm]."
     )
     wrong_unit = (
-        "The current, or v_out divided by it, has no size that a load at an electrode can have. Is "
-        "the current in ampere and not in mA, and v_out in volt? Are the two exchanged? Correct "
-        "the scale or the channel."
+        "The current, or v_out divided by it, has no size that a load at an electrode can have. "
+        "Most likely the current is in mA: give ampere and volt, and check that the two are not "
+        "exchanged."
     )
     unconnected = (
-        "v_out equals v_th within the noise: no load draws a current, or both are the same record. "
-        "Is the finger on the electrode, or in a calibration, is the resistor connected? Check the "
-        "contact and the channels."
+        "v_out equals v_th within the noise: no load draws a current, or both are the same "
+        "record. Check the channels, and the contact of the finger or of the resistor."
     )
     inconsistent = (
-        "The recording and the calibrations contradict each other about the source impedance, or "
-        "their unloaded voltages differ by more than amplitude and delay. "
-        "The driver changed in between, or r_load is wrong: calibrate again. If the recording has "
-        "a current too, its scale may be wrong; to leave it out, use replace(current=None)."
+        "Recording and calibrations contradict each other about the source impedance or the "
+        "unloaded voltage. Most likely the driver changed in between, or r_load is wrong: "
+        "calibrate again. Beside a driver, check the scale of a current too."
     )
     out_of_bounds = (
         "Recording and bounds contradict each other: without its bounds an element lies more than "
@@ -92,17 +84,13 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     driver_unclear = (
         "The calibrations are too noisy: this recording moves the source impedance further than "
-        "the fit can follow them. Repeat the calibrations with less noise, more periods or a "
-        "second resistor, or identify all recordings together with identify_jointly."
+        "the fit can follow. Repeat them with more periods or a second resistor, or identify all "
+        "recordings together with identify_jointly."
     )
     biased = (
-        "Noise has shifted the estimate by several standard errors: with Steiglitz-McBride from "
-        "the minimum of its own model, with a non-parametric fit from the estimate without noise. "
-        "Or the sample rate is too low for the interpolation of output error, which misses the "
-        "recording by more than its noise. Use the default method. With the default method: a "
-        "pulse period is a whole number of samples, so that aliases fall on the harmonics, and the "
-        "power near half the sample rate says that they are large. Use an anti-alias filter, a "
-        "higher sample rate, or a pulse rate whose period is not a whole number of samples."
+        "Noise, aliases or a low sample rate shifted the estimate by several standard errors. Use "
+        "the default method; if it is the default, use an anti-alias filter, or pulses whose "
+        "period is not a whole number of samples."
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
     repeated = (
@@ -116,10 +104,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     nonfinite_samples = "A record contains NaN or infinite samples. Cut them out or record again."
     too_short = "The record is too short to identify anything. Record a whole pulse and its tail."
     misaligned = (
-        "v_out carries more power than v_th, or is not aligned in time with v_th or the current in "
-        "all periods. "
-        "Swap the two records, or align them on the edge of the pulse, or correct the unit or the "
-        "polarity of one of them."
+        "v_out carries more power than v_th, or is not aligned in time with v_th or the current. "
+        "Align the records on the edge of the pulse, and check that they are not exchanged, their "
+        "unit and polarity."
     )
     rate_mismatch = (
         "The distance between the pulses of v_th or the current contradicts sample_rate and "
@@ -212,5 +199,10 @@ def message(name: str) -> str:
         return (
             "The iteration did not converge; the fit reports the best iterate. "
             "Average more periods, or use method='output_error'."
+        )
+    if name == "nonfinite":  # optimistix names no cause
+        return (
+            "inf or NaN appeared during the fit. Most likely the numbers are far from those of an "
+            "electrode: check the units and r_load, or use method='output_error'."
         )
     return RESULTS[RESULTS._name_to_item[name]]
