@@ -112,6 +112,23 @@ def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_pa
     assert about.items() <= schema.metadata.items()
 
 
+@pytest.mark.parametrize("read", [pandas.read_csv, pandas.read_parquet])
+def test_a_long_table_has_a_row_for_each_element(fits, file, parts, tmp_path, read):
+    target = tmp_path / f"long.{read.__name__.removeprefix('read_')}"
+    etid.export_fits(file, target, long=True)
+    options = {"keep_default_na": False, "na_values": ["nan"]} if read is pandas.read_csv else {}
+    found = read(target, **options)
+    pandas.testing.assert_frame_equal(
+        found[["path", "element", "unit", "value", "stderr", "verdict"]],
+        fits.to_pandas(long=True)[["path", "element", "unit", "value", "stderr", "verdict"]],
+        check_dtype=False,
+    )
+    assert len(found) == 3 * COUNT
+    wide = found.pivot(index="path", columns="element", values="value").loc[fits.labels["path"]]
+    np.testing.assert_array_equal(wide["c_p"], fits.circuit.c_p)
+    assert not {"r_s", "r_s_stderr", "r_s_change", "amplitude_change"} & set(found)
+
+
 def test_fits_of_a_circuit_of_ones_own_are_exported_without_its_class(file, tmp_path):
     with h5py.File(file, "a") as content:
         content.attrs.update(circuit="Mine", parameters=["r_a"])
@@ -318,6 +335,10 @@ def test_a_missing_package_is_named_with_its_extra(
         (
             ("fits.h5", "-o", "t.csv", "--session-start", "2026-01-31"),
             "--session-start is only for .nwb",
+        ),
+        (
+            ("fits.h5", "-o", "t.json", "--long"),
+            "t.json: --long is only for .csv and .parquet",
         ),
         (("fits.h5", "-o", "t.csv", "--path", "path 1"), "t.csv: --path is only for .cir and"),
         (("fits.h5", "-o", "t.cir"), "say which recording"),
