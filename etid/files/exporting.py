@@ -27,13 +27,18 @@ from etid.results.fits_columns import long_form
 from etid.results.hdf5_table import REMEDY, Table, opened_table, same_length
 
 ROWS = 1 << 16  # fits in memory at a time
+QUALITY = ("rrse", "chi2", "steps", "remarks")
 CIRCUITS = (".cir", ".json")
 
 
 def export_fits(
-    source: str | os.PathLike[str], target: str | os.PathLike[str], *, long: bool = False
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    long: bool = False,
+    all: bool = False,
 ) -> None:
-    """Write the table of a file of fits, `Fits.table()`, for other programs.
+    """Write the table of a file of fits for other programs: labels, elements ±, verdicts, notes.
 
     - `.csv`: one line of column names, such as `r_s [ohm]` and `r_s_stderr [ohm]`, then one line
       per fit. Numbers are in SI units with all digits. An unknown number is `nan`. A text that
@@ -48,6 +53,8 @@ def export_fits(
         source: File of fits.
         target: File to write. An existing file is replaced at the end.
         long: As in `Fits.table`: one line per element.
+        all: Write all columns of `Fits.table()`: also the changes of the elements, χ² and other
+            columns of quality.
 
     Raises:
         ValueError: The source is not a file of fits, or the target has another suffix.
@@ -61,6 +68,9 @@ def export_fits(
     with opened_table(source, SCHEMA) as table, replacing(target) as partial:
         names = _elements(table)
         columns = _columns(table, names)
+        if not all:
+            more = {f"{name}_change" for name in (*names, "amplitude")} | {*QUALITY}
+            columns = {name: column for name, column in columns.items() if name not in more}
         units = {name: _units(column, table) for name, column in columns.items()}
         parts = _parts(table, columns)
         if long:
