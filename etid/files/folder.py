@@ -95,8 +95,11 @@ def import_folder(
     root = pathlib.Path(os.fspath(folder))
     found, unmatched = labelled(root, [labels] if isinstance(labels, str) else labels)
     common = channels_of({name: value for name, value in given.items() if value is not None})
+    turns = {name: common.pop(name) for name in ("split", "electrode") if name in common}
     tables = {file: {**of, "path": _path(of)} for file, of in found.items()}
     for file, of in tables.items():
+        if "r_load" not in of:  # calibrations are not split
+            of.update(turns)
         names = _calibrations(file, of, tables)
         if names:
             of["calibration"] = names
