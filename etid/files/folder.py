@@ -9,7 +9,6 @@ listed.
 The table `calibrations.csv` of a folder, with the columns `file` and `ohm`, names resistors too.
 """
 
-import csv
 import dataclasses
 import os
 import pathlib
@@ -26,6 +25,7 @@ from etid.files.pattern import Pattern
 from etid.recordings.errors import RecordingError
 from etid.recordings.fields import LABELS, real
 from etid.recordings.replacing import replacing
+from etid.recordings.tables import rows_of
 
 TABLE = "calibrations.csv"
 _RESISTANCE = re.compile(r"(\d+)([RkM])(\d*)|(\d+(?:\.\d+)?)([RkM]?)")
@@ -189,17 +189,13 @@ def _table(root: pathlib.Path) -> dict[str, float]:
     table = root / TABLE
     if not table.is_file():
         return {}
-    with located(str(table)), table.open(encoding="utf-8-sig", newline="") as lines:
-        rows = list(csv.DictReader(lines, skipinitialspace=True))
-        if not rows or not {"file", "ohm"} <= rows[0].keys():
-            raise RecordingError("must have the columns file and ohm, and a row for each file")
+    with located(str(table)):
         found = {}
-        for row in rows:
-            file, ohm = str(row["file"]).strip(), str(row["ohm"]).strip()
+        for row in rows_of(table, ("file", "ohm")):
             try:
-                found[file] = real("ohm", float(ohm))
+                found[row["file"]] = real("ohm", float(row["ohm"]))
             except ValueError:
-                found[file] = resistance(ohm, str(table))
+                found[row["file"]] = resistance(row["ohm"], str(table))
         return found
 
 
