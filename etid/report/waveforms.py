@@ -18,7 +18,7 @@ from etid.report.tables import significant
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.results.fits import Fits
-from etid.results.study_fits import StudyFits
+from etid.results.study_fits import StudyFits, sha256
 
 FAILED, STRAINED, UNCERTAIN = 6, 3, 3  # largest number of fits of each kind
 
@@ -61,10 +61,10 @@ class Recordings:
     def _open(self, path: pathlib.Path) -> None:
         self.study, self._opened = read(path), True
         settings = self._found.settings
-        if settings is not None and settings.source_size not in (0, path.stat().st_size):
+        if settings is not None and settings.source_sha256 not in ("", sha256(path)):
             self.problem = (
-                f"{path} has changed since the fits were made: it had {settings.source_size} bytes "
-                f"and has {path.stat().st_size} now. The waveforms may differ from the fits."
+                f"{path} has changed since the fits were made: its SHA-256 is no longer "
+                f"{settings.source_sha256}. The waveforms may differ from the fits."
             )
 
     def _look(self, file: pathlib.Path | None) -> None:
@@ -109,6 +109,8 @@ class Recordings:
         names = ("path", *LABELS)
         shown = recording.replace(**{name: plain(getattr(recording, name)) for name in names})
         names = recording.calibration or tuple(self.study.calibrations)
+        if self._found.settings is not None and self._found.settings.driver:
+            names = next(iter(self._found.drivers), ())  # the only driver, of another file
         by_current = recording.cause == "current"  # the fit needs no driver then
         driver = None if by_current else self._found.drivers.get(names)
         figure, why = _predicted(shown, fit, driver)
