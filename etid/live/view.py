@@ -35,7 +35,7 @@ LAST = 0.5  # [s] that the windows have to see the last one
 COLUMNS = 7  # electrodes in a row of the paper's display
 ALARMS = 12  # alarms that are listed
 NAMED = 6  # electrodes that an alarm names
-GOOD = "good"
+GOOD, UNKNOWN = "good", "not identified: too_short"
 CAPS = ("peak", "charge", "guard", "voltage")  # reasons of a command that are a cap
 HIGH = 0.2  # of the largest voltage, which is exceeded where the pulse is drawn
 NANO = 1e-9
@@ -126,7 +126,7 @@ class LiveView:
         with listening:  # the other process has it
             self._process.start()
         self._due = self._slowest = 0.0
-        self._words: list[str] = [GOOD] * number
+        self._words = [UNKNOWN] * number
         self._alarms: deque[str] = deque(maxlen=ALARMS)
         self._compile()
 
