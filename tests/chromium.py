@@ -58,7 +58,7 @@ class Page:
         """The value of an expression of JavaScript, in the page."""
         result = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
         assert "exceptionDetails" not in result, result
-        return result["result"]["value"]
+        return result["result"].get("value")  # undefined has none
 
     def show(self, *, dark: bool = False, printed: bool = False) -> None:
         """How the page is looked at from here on."""

@@ -382,7 +382,7 @@ def _judged(model: GainModel, driver_result: RESULTS, state: TrackerState) -> Fi
     )
 
 
-@program
+@jax.jit  # as `etid.online.tick.updated`
 def _lowest(model: GainModel, own: Float[Array, "lane own"]) -> Complex[Array, " lane"]:
     """Impedance of each load at the lowest frequency [Ω]."""
     lowest = model.bands.frequency[:1]
