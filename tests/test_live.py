@@ -89,7 +89,8 @@ def controller_of(electrodes, **limits):
 def tick_of(tracker, number=0, changes=(), *, stopped=False, reason="wanted"):
     """A tick of a display that was shown nothing yet."""
     lanes, state = tracker.electrodes, tracker.start()
-    command = Command(*5 * [np.ones(lanes)], np.full(lanes, reason))
+    ones = np.ones(lanes)
+    command = Command(ones, ones, ones, ones, ones, np.full(lanes, reason))
     window = np.zeros((lanes, tracker.model.bands.samples))
     return Tick(number, window, state, state, command, list(changes), stopped, 1e-3, 0, 0)
 
@@ -194,7 +195,7 @@ def test_alarms_are_words():
     assert [text for text in found["alarms"] if text] == [
         "Pulse 7: cap reached: charge, at E1, E2, E3, E4, E5, E6 and 4 more",
         "Pulse 7: the driver has changed; calibrate again",
-        "Pulse 7: jump of r_p, × 0.094, at E5",
+        "Pulse 7: jump of r_p, to 0.094 times its value, at E5",
     ]
 
 
@@ -230,7 +231,8 @@ def test_the_loop_waits_for_no_page_and_no_memory_grows(monkeypatch):
     monkeypatch.setattr(views, "EVERY", 0.0)
     tracker = tracker_of(DISPLAY, 3e-3)
     with LiveView(controller_of(DISPLAY), charge=WANTED, controls=True, port=0) as view:
-        seconds, sizes = [], []
+        seconds, sizes, pid = [], [], view._process.pid
+        assert pid is not None
 
         def hand_over(number):
             tick = tick_of(tracker, number)
@@ -245,12 +247,12 @@ def test_the_loop_waits_for_no_page_and_no_memory_grows(monkeypatch):
             if number in (100, 599):
                 sizes.append(resident(view._process))
         assert sizes[1] - sizes[0] < 4e6
-        os.kill(view._process.pid, signal.SIGSTOP)
+        os.kill(pid, signal.SIGSTOP)
         try:
             for number in range(600):
                 hand_over(number)
         finally:
-            os.kill(view._process.pid, signal.SIGCONT)
+            os.kill(pid, signal.SIGCONT)
         # A snapshot is due at every sixth pulse of 16.7 ms. The processor's time of this thread, as
         # other tests run beside it; one that waited for a frozen process would wait for ever.
         taken, passed = np.array(seconds).reshape(2, 600, 2).transpose(2, 0, 1)
@@ -283,6 +285,7 @@ if __name__ == "__main__":
     time.sleep(60)
 """
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as program:
+        assert program.stdout is not None
         port = int(program.stdout.readline())
         program.kill()
     for _ in range(200):
@@ -301,9 +304,7 @@ def running(view, stimulator, controller):
 
     def run():
         with connected(stimulator.address) as line:
-            stream = follow(
-                received(line), controller, charge=WANTED, send=sender(line), view=view
-            )
+            stream = follow(received(line), controller, charge=WANTED, send=sender(line), view=view)
             ticks.extend(tick._replace(window=None, before=None) for tick in stream)
 
     thread = threading.Thread(target=run)
@@ -344,9 +345,11 @@ def test_a_browser_shows_the_skin_and_stops_it():
                 until(browser, f"{alike} > 100 && {fill('E6')} === 'white'")
                 alarms = browser.evaluate("document.getElementById('alarms').innerText")
                 assert re.search(r"Pulse \d+: contact lost, at E6", alarms)
-                assert re.search(r"Pulse \d+: jump of r_\w, × 0\.\d+, at E4", alarms)
+                assert re.search(
+                    r"Pulse \d+: jump of r_\w, to 0\.\d+ times its value, at E4", alarms
+                )
                 mark = "document.querySelector('#charge g[data-name=E6] text').textContent"
-                assert browser.evaluate(mark) == "×"
+                assert browser.evaluate(mark) == "\u00d7"
                 # Another electrode's pulse, with its prediction.
                 click = "dispatchEvent(new MouseEvent('click'))"
                 browser.evaluate(f"document.querySelector('#value g[data-name=E4]').{click}")

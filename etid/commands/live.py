@@ -1,6 +1,7 @@
 """Show and control a running display in the browser."""
 
 import argparse
+import collections
 import contextlib
 import pathlib
 import sys
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     cap = {} if arguments.charge_cap is None else {"charge_cap": arguments.charge_cap}
     controller = Controller.of(tracker, **cap)
     layout = None if arguments.layout is None else read_layout(arguments.layout)
-    send, tick = None, None
+    send = None
     with contextlib.ExitStack() as opened:
         if arguments.socket is None:
             rate = records[0].sample_rate
@@ -72,10 +73,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
             )
         )
         print(f"{view.address} shows the display; Ctrl-C ends it", file=sys.stderr, flush=True)
-        for tick in follow(blocks, controller, charge=arguments.charge, send=send, view=view):
-            pass
-    if tick is None:
+        ticks = follow(blocks, controller, charge=arguments.charge, send=send, view=view)
+        last = collections.deque(ticks, maxlen=1)
+    if not last:
         raise ValueError("the stream ended before the first pulse")
+    tick = last[0]
     data = {
         "source": arguments.socket or arguments.file,
         "pulses": tick.number + 1,

@@ -11,8 +11,7 @@ import secrets
 import socket
 import time
 from collections import deque
-from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import jax
 import numpy as np
@@ -143,8 +142,8 @@ class LiveView:
                 text = "the driver has changed; calibrate again"
             else:
                 text = (
-                    f"{change.kind} of {change.element}, × {change.factor:.2g}, at "
-                    f"{self._names[change.electrode]}"
+                    f"{change.kind} of {change.element}, to {change.factor:.2g} times its value, "
+                    f"at {self._names[change.electrode]}"
                 )
             self._alarms.appendleft(pulse + text)
         self._slowest = max(self._slowest, tick.seconds)
@@ -152,7 +151,7 @@ class LiveView:
             return
         self._due = time.monotonic() + EVERY
         self._alarm(pulse, self._seen(tick))
-        state, command = tick.state.electrodes, tick.command
+        state = tick.state.electrodes
         at = min(self._slot.electrode.value, len(self._names) - 1)
         of = self._snapshot[0]
         of["pulse"], of["missing"], of["late"] = tick.number + 1, tick.missing, tick.late
@@ -174,12 +173,10 @@ class LiveView:
         self._process.terminate()
         self._process.join()
 
-    def __enter__(self) -> "LiveView":
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _compile(self) -> None:
@@ -229,7 +226,7 @@ class LiveView:
         gain = self._gain(np.asarray(before.own)[at])
         turn = np.arange(1, x.size + 1) / bands.samples  # per sample
         centres = np.asarray(bands.frequency) / bands.sample_rate
-        by_bin = np.interp(turn, centres, gain.real) + 1j * np.interp(turn, centres, gain.imag)
+        by_bin = np.interp(turn, centres, gain)
         spectrum = np.zeros(bands.samples // 2 + 1, complex)
         spectrum[1 : x.size + 1] = x * by_bin * np.exp(-2j * np.pi * turn * own[-1])
         pulse = np.fft.irfft(np.asarray(state.amplitude)[at] * spectrum, bands.samples)

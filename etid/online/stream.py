@@ -125,7 +125,9 @@ class Pulses:
         """First sample of a pulse: the nearest to the start of its period."""
         return round(number * self.period)
 
-    def cut(self, blocks: Iterable[Block]) -> Iterator[tuple[int, Float[np.ndarray, "lane sample"]]]:
+    def cut(
+        self, blocks: Iterable[Block]
+    ) -> Iterator[tuple[int, Float[np.ndarray, "lane sample"]]]:
         """The number of each pulse and its window [V]; what is missing is NaN.
 
         Raises:
