@@ -71,8 +71,9 @@ def main(arguments: argparse.Namespace) -> bool:
     period = tracker.period / tracker.model.bands.sample_rate
     number = round(60 * arguments.minutes / period)
     ticks, memory = [], []
-    with Timed(controller, charge=CHARGE, controls=False, port=arguments.port) as view:
-        view.taken = []
+    view = Timed(controller, charge=CHARGE, controls=False, port=arguments.port)
+    view.taken = []
+    with view:
         print(view.address, flush=True)
         reader = [sys.executable, "-c", READER, view.address]
         readers = [subprocess.Popen(reader) for _ in range(arguments.windows)]

@@ -11,7 +11,7 @@ import secrets
 import socket
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -173,7 +173,7 @@ class LiveView:
         self._process.terminate()
         self._process.join()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "LiveView":
         return self
 
     def __exit__(self, *_: object) -> None:
