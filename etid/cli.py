@@ -44,6 +44,7 @@ COMMANDS = {
         "merging",
         "write the recordings of several files into one file, each in a group of its own",
     ),
+    "live": ("live", "show and control a running display in the browser"),
     "simulate": ("simulate", "simulate recordings of an experiment"),
 }
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")  # the shells that shtab supports
