@@ -20,7 +20,7 @@ from etid.results.fit import Fit
 from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits, sha256
 
-FAILED, STRAINED, UNCERTAIN = 6, 3, 3  # largest number of fits of each kind
+FAILED, STRAINED, UNCERTAIN = 6, 2, 2  # largest number of fits of each kind
 
 
 class Recordings:
@@ -140,18 +140,14 @@ def _predicted(recording: Recording, fit: Fit, driver: Driver | None) -> tuple[F
 
 
 def waveforms(fits: Fits, place: Recordings) -> Section:
-    """Measured and predicted pulses of the worst fits, or of all if they are few."""
+    """Measured and predicted pulses of the worst fits."""
     text = (
         "First fits without success: for each verdict those with the largest χ². Then successful "
         "fits with the largest χ² and with the largest standard error. One pulse of each."
     )
     chosen = worst(fits)
-    all_drawn = len(fits) <= 24
-    if all_drawn:
-        chosen = dict.fromkeys(range(len(fits)), "") | chosen
     if len(fits) == 1:
-        text = "One pulse."
-        chosen = {0: ""}
+        text, chosen = "One pulse.", {0: ""}
     text += (
         " If the model is right, the residual is noise. At the edges of a pulse it also contains "
         "frequencies near half the sample rate, which are aliased and not fitted."
@@ -166,7 +162,7 @@ def waveforms(fits: Fits, place: Recordings) -> Section:
             pictures.append(picture)
     if missing:
         text += f"\n\nThese recordings cannot be read and have no waveform: {', '.join(missing)}."
-    heading = "Waveforms" if all_drawn else "Worst fits"
+    heading = "Worst fits" if len(fits) > 1 else "Waveform"
     return Section(heading, text, (), tuple(pictures), warning=place.problem)
 
 
