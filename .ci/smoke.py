@@ -65,6 +65,10 @@ def in_python():
     for name, true in TRUTH.items():
         error = abs(float(getattr(fit.circuit, name)) - true)
         assert error < 5 * float(getattr(fit.stderr, name)), name  # 1 in 10⁶ by chance
+    skins = [study[path] for path in study if path.startswith("typical")]
+    batch = etid.identify_skins(skins * 50, driver)  # so large that XLA compiles it
+    assert compiled, "XLA compiles a large batch"
+    assert batch.counts()["successful"] >= 450, batch.counts()  # one of ten is a false alarm
 
 
 def on_the_command_line(folder):

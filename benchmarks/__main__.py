@@ -15,7 +15,7 @@ NAMES = (
     *("spice", "coverage", "driver_order", "delays", "noise", "selection", "design"),
     *("speed", "curves", "scale", "amplitudes", "amplitude_errors", "online", "control"),
     *("speed_accuracy", "which", "paper", "failure_map", "perturbations", "spectra", "rivals"),
-    *("referee", "fuzz", "mutation"),
+    *("referee", "fuzz", "mutation", "live"),
 )
 PLACES = {"rivals": "rivals.table"}  # modules of other names
 

@@ -13,15 +13,17 @@ whole file is faulty. JSON has no infinity and no NaN: such a number is null.
 """
 
 import argparse
+import contextlib
 import importlib
 import importlib.metadata
 import json
+import logging
 import math
 import os
 import pathlib
 import platform
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,6 +44,7 @@ COMMANDS = {
         "merging",
         "write the recordings of several files into one file, each in a group of its own",
     ),
+    "live": ("live", "show and control a running display in the browser"),
     "simulate": ("simulate", "simulate recordings of an experiment"),
 }
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")  # the shells that shtab supports
@@ -89,7 +92,8 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
     try:
         if "force" in arguments:
             check_outputs(arguments.module.outputs(arguments), force=arguments.force)
-        outcome = arguments.module.run(arguments)
+        with _logged() if arguments.verbose else contextlib.nullcontext():
+            outcome = arguments.module.run(arguments)
     except (RecordingError, IdentificationError, ValueError, OSError) as error:
         text = " ".join(str(error).split())
         print(f"etid: error: {text}", file=sys.stderr)
@@ -102,6 +106,20 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
         data = {"command": arguments.command, "status": outcome.status, **outcome.data}
         text = json.dumps(_plain(data), ensure_ascii=False, allow_nan=False)
     return max(outcome.status, _print(text))
+
+
+@contextlib.contextmanager
+def _logged() -> Iterator[None]:
+    """Show what the logger `etid` says, on stderr."""
+    logger, handler = logging.getLogger("etid"), logging.StreamHandler()
+    before = logger.level
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 def _after_interrupt(arguments: argparse.Namespace) -> str:
@@ -122,6 +140,9 @@ def parser(wanted: Iterable[str] = COMMANDS) -> argparse.ArgumentParser:
         prog="etid",
         description="Identify circuits from electro-tactile stimulation recordings.",
         epilog="Exit status: 0 done, 1 faulty data, 2 wrong usage, 130 interrupted.",
+    )
+    parser.add_argument(
+        "--verbose", action="store_true", help="say on stderr what is done to each recording"
     )
     parser.add_argument("--version", action=_Version, help="print versions")
     parser.add_argument(

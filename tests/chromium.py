@@ -47,9 +47,10 @@ class Page:
                 assert "error" not in answer, answer
                 return answer["result"]
 
-    def open(self, file: pathlib.Path) -> None:
-        """Load a file and wait until all its pictures are there."""
-        self.call("Page.navigate", url=file.as_uri())
+    def open(self, page: pathlib.Path | str) -> None:
+        """Load a file or an address and wait until all its pictures are there."""
+        url = page if isinstance(page, str) else page.as_uri()
+        self.call("Page.navigate", url=url)
         while self._next().get("method") != "Page.loadEventFired":
             pass
 
@@ -57,7 +58,7 @@ class Page:
         """The value of an expression of JavaScript, in the page."""
         result = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
         assert "exceptionDetails" not in result, result
-        return result["result"]["value"]
+        return result["result"].get("value")  # undefined has none
 
     def show(self, *, dark: bool = False, printed: bool = False) -> None:
         """How the page is looked at from here on."""

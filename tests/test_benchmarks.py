@@ -42,6 +42,10 @@ CASES = {
     "design": ("", "", "times better than 60 Hz"),
     "driver_order": ("--drivers 1 --snr-db 60 --orders 4 5 --data {}", "", "100 % right"),
     "fuzz": ("--files 3 --kind csv --output {}/f.json", "f.json", "0 faults in 3 files"),
+    "live": (
+        "--electrodes 4 --minutes 0.02 --output {}/live.csv", "live.csv",
+        "growth of the page's memory [MB]",
+    ),
     "noise": ("--drivers 2 --snr-db 60 --only white", "", "60 dB, white, dry: covered"),
     "online": (
         "--electrodes 4 --ticks 3 --hours 0.01 --output {}/online.csv", "online.csv",

@@ -1,4 +1,5 @@
 import dataclasses
+import hashlib
 
 import numpy as np
 import pytest
@@ -93,3 +94,75 @@ def test_a_file_without_calibrations_is_refused(scene, tmp_path, capsys):
     etid.Study.from_recordings([skin]).write(study)
     assert main(["calibrate", str(study), "-o", str(tmp_path / "driver.h5")]) == 1
     assert "holds no recording with a known resistor" in capsys.readouterr().err
+
+
+def test_a_file_is_fitted_with_the_driver_of_another(scene, today, tmp_path, capsys):
+    source, driver, fits = (tmp_path / name for name in ("day.h5", "driver.h5", "fits.h5"))
+    today.write(driver)
+    day = [one for one in scene.simulate(seed=3).loaded.recordings()][:3]
+    etid.Study.from_recordings(one.replace(calibration=()) for one in day).write(source)
+    assert main(["fit", str(source), "--driver", str(driver), "-o", str(fits)]) == 0
+    assert f"order {today.driver.order}, successful" in capsys.readouterr().out
+    found = etid.StudyFits.read(fits)
+    assert list(found.drivers) == [("driver.h5/calibration/98k8",)]
+    assert found.settings.driver == str(driver)
+    assert found.settings.source_sha256 == hashlib.sha256(source.read_bytes()).hexdigest()
+    expected = etid.identify_skins(day, today.driver)
+    np.testing.assert_allclose(found.fits.circuit.r_p, expected.circuit.r_p, rtol=1e-6)
+    assert main(["report", str(fits), "-o", str(tmp_path / "page.html")]) == 0
+    assert "hold no driver" not in (tmp_path / "page.html").read_text("utf-8")
+    with etid.read(source) as study:
+        assert not study.calibrations
+
+
+def two_sessions(study):
+    first = study["calibration/98k8"]
+    return [first.replace(path=f"calibration/{day}", session=day) for day in ("d1", "d2")]
+
+
+def two_named(study):
+    first = study["calibration/98k8"]
+    known = [first.replace(path=f"calibration/{day}") for day in ("d1", "d2")]
+    skin = study["typical/dry/01"]
+    return known + [
+        skin.replace(path=f"loaded/{one.path[-2:]}", calibration=(one.path,)) for one in known
+    ]
+
+
+@pytest.mark.parametrize(
+    ("held", "options", "message"),
+    [
+        (lambda study: [study["typical/dry/01"].replace(calibration=())], [], "no recording with"),
+        (two_sessions, [], "holds calibrations of sessions d1, d2. Write those of one"),
+        (two_named, [], "holds calibrations of several drivers"),
+        (None, [], "there is no such file"),
+        (lambda study: [study["calibration/98k8"]], ["--joint"], "remove --driver, or --joint"),
+        (
+            lambda study: [study["calibration/98k8"]],
+            ["--method", "steiglitz_mcbride"],
+            'order="auto" needs maximum likelihood',
+        ),
+    ],
+)
+def test_refusals_of_the_driver_of_another_file(scene, tmp_path, capsys, held, options, message):
+    study, driver = scene.simulate(seed=0), tmp_path / "driver.h5"
+    study.write(tmp_path / "day.h5")
+    if held is not None:
+        etid.Study.from_recordings(held(study)).write(driver)
+    command = ["fit", str(tmp_path / "day.h5"), "--driver", str(driver)]
+    assert main([*command, "-o", str(tmp_path / "fits.h5"), *options]) == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "fits.h5").exists()
+
+
+def test_a_discrete_driver_of_another_sample_rate_is_refused_for_each_recording(scene, tmp_path):
+    study, driver = scene.simulate(seed=0), tmp_path / "driver.h5"
+    known = study["calibration/98k8"]
+    slower = {"v_th": known.v_th[::2], "v_out": known.v_out[::2], "adc_range": None}
+    slow = known.replace(**slower, sample_rate=known.sample_rate / 2)
+    etid.Study.from_recordings([slow]).write(driver)
+    study.write(tmp_path / "day.h5")
+    options = {"driver": driver, "order": 5, "method": "steiglitz_mcbride"}
+    found = etid.fit_file(tmp_path / "day.h5", tmp_path / "fits.h5", **options)
+    assert not found.fits.counts().get("successful")
+    assert "same sample rate" in found.fits.notes[0]

@@ -352,6 +352,8 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(run, stud
     assert rows.keys() == cli.COMMANDS.keys()
     table = tmp_path / "t.csv"
     np.savetxt(table, np.ones((500, 2)), delimiter=",", header="open,skin", comments="")
+    with h5py.File(tmp_path / "p.h5", "w") as pulses:
+        pulses["v_out"] = np.zeros((1, 5000))
     names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
     rates = ("--sample-rate", 2e5, "--pulse-rate", 60)
     calls = {
@@ -363,6 +365,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(run, stud
         "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
         "report": (tmp_path / "f.h5",),
         "export": (tmp_path / "f.h5", "-o", tmp_path / "f.csv"),
+        "live": (study_file, "--file", tmp_path / "p.h5", "--electrodes", 1, "--port", 0),
     }
     assert calls.keys() == cli.COMMANDS.keys()
     for command, arguments in calls.items():
@@ -372,7 +375,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(run, stud
         assert set(found) - {"command", "status"} <= told, command
         if command == "fit":
             assert (found["method"], found["drivers"][0]["order"]) == ("equation_error", 3)
-        written = {"check": "file", "report": "page"}.get(command, "target")
+        written = {"check": "file", "report": "page", "live": "source"}.get(command, "target")
         assert set(found) >= {"command", "status", written}
         inner = [item for value in found.values() if isinstance(value, list) for item in value]
         keys = {
@@ -389,6 +392,15 @@ def test_json_of_an_error_is_on_stdout_and_its_line_on_stderr(run):
     data = as_json(printed)
     assert status == data["status"] == WRONG_DATA
     assert (data["command"], complaints) == ("fit", [f"etid: error: {data['error']}"])
+
+
+def test_verbose_says_on_stderr_what_is_done(run, study_file, tmp_path):
+    status, printed, said = run("--verbose", "fit", study_file, "-o", tmp_path / "fits.h5")
+    assert status == DONE
+    assert any(re.match(r"calibration/98k8: Driver of order 5", line) for line in said)
+    assert sum("SkinRC: successful" in line for line in said) == 3
+    again = run("fit", study_file, "-o", tmp_path / "fits.h5", "--force")
+    assert again == (DONE, printed, [])
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)

@@ -1,5 +1,7 @@
 """A spike or a burst in one of several periods: that period is left out."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -52,6 +54,22 @@ def test_a_disturbed_period_is_left_out_and_the_elements_are_right(driver, load,
     assert set(fits.verdicts) == {"successful"}
     np.testing.assert_array_equal(np.asarray(fits.fit.remarks) & LEFT_OUT, LEFT_OUT)
     assert np.abs(off(fits, load)).max() < 4.0  # one of 12 normal numbers in 1300
+
+
+def test_the_log_says_what_was_done_to_a_recording(driver, caplog, capsys):
+    clean = rung("dry", samples=20_000).simulate(0)[TRIAL]
+    late = with_spike(clean.replace(v_out=np.roll(clean.v_out, 3)), 2)
+    etid.identify_skin(late, driver)
+    assert caplog.messages == []
+    assert capsys.readouterr() == ("", "")
+    with caplog.at_level("INFO", logger="etid"):
+        etid.identify_driver(rung("dry").simulate(0)[CALIBRATION])
+        etid.identify_skin(late, driver)
+    of_driver, left, lag, fit = caplog.messages
+    assert re.match(rf"{CALIBRATION}: Driver of order 5: successful in \d+ steps", of_driver)
+    assert left == f"{TRIAL}: left out of 6 periods: 3."
+    assert lag == f"{TRIAL}: v_out was taken 3 samples earlier."
+    assert re.match(rf"{TRIAL}: SkinRC: successful in \d+ steps", fit)
 
 
 def test_a_disturbance_over_a_joint_disturbs_both_periods():

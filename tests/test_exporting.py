@@ -70,7 +70,7 @@ def parts(request, monkeypatch):
 
 def test_a_csv_table_has_every_digit_and_its_units_in_the_names(fits, file, parts, tmp_path):
     target = tmp_path / "table.csv"
-    etid.export_fits(file, target)
+    etid.export_fits(file, target, all=True)
     with target.open(newline="", encoding="utf-8") as text:
         rows = list(csv.DictReader(text))
     table = fits.table()
@@ -84,6 +84,16 @@ def test_a_csv_table_has_every_digit_and_its_units_in_the_names(fits, file, part
             np.testing.assert_array_equal(np.array(found, float), column)
         else:
             assert found == list(column)
+
+
+def test_changes_and_quality_are_exported_when_all_is_asked_for(fits, file, tmp_path):
+    target = tmp_path / "table.csv"
+    assert cli.main(["export", str(file), "-o", str(target)]) == 0
+    more = {"r_s_change", "r_p_change", "c_p_change", "amplitude_change"}
+    more |= {"rrse", "chi2", "steps", "remarks"}
+    assert set(fits.table()) - {head.partition(" ")[0] for head in pandas.read_csv(target)} == more
+    assert cli.main(["export", str(file), "-o", str(target), "--all", "--force"]) == 0
+    assert "chi2" in set(pandas.read_csv(target))
 
 
 def test_no_text_of_a_csv_table_is_a_formula(fits, tmp_path):
@@ -100,7 +110,7 @@ def test_no_text_of_a_csv_table_is_a_formula(fits, tmp_path):
 
 def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_path):
     target = tmp_path / "table.parquet"
-    etid.export_fits(file, target)
+    etid.export_fits(file, target, all=True)
     pandas.testing.assert_frame_equal(
         pandas.read_parquet(target), fits.to_pandas(), check_dtype=False
     )
@@ -112,12 +122,29 @@ def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_pa
     assert about.items() <= schema.metadata.items()
 
 
+@pytest.mark.parametrize("read", [pandas.read_csv, pandas.read_parquet])
+def test_a_long_table_has_a_row_for_each_element(fits, file, parts, tmp_path, read):
+    target = tmp_path / f"long.{read.__name__.removeprefix('read_')}"
+    etid.export_fits(file, target, long=True)
+    options = {"keep_default_na": False, "na_values": ["nan"]} if read is pandas.read_csv else {}
+    found = read(target, **options)
+    pandas.testing.assert_frame_equal(
+        found[["path", "element", "unit", "value", "stderr", "verdict"]],
+        fits.to_pandas(long=True)[["path", "element", "unit", "value", "stderr", "verdict"]],
+        check_dtype=False,
+    )
+    assert len(found) == 3 * COUNT
+    wide = found.pivot(index="path", columns="element", values="value").loc[fits.labels["path"]]
+    np.testing.assert_array_equal(wide["c_p"], fits.circuit.c_p)
+    assert not {"r_s", "r_s_stderr", "r_s_change", "amplitude_change"} & set(found)
+
+
 def test_fits_of_a_circuit_of_ones_own_are_exported_without_its_class(file, tmp_path):
     with h5py.File(file, "a") as content:
         content.attrs.update(circuit="Mine", parameters=["r_a"])
         for ending in ("", "_stderr", "_change"):
             content.move(f"r_s{ending}", f"r_a{ending}")
-    etid.export_fits(file, tmp_path / "table.csv")
+    etid.export_fits(file, tmp_path / "table.csv", all=True)
     head = (tmp_path / "table.csv").read_text("utf-8").splitlines()[0]
     assert "r_a [ohm],r_a_stderr [ohm],r_a_change,amplitude_change,rrse" in head
     assert "r_p" not in head
@@ -319,6 +346,11 @@ def test_a_missing_package_is_named_with_its_extra(
             ("fits.h5", "-o", "t.csv", "--session-start", "2026-01-31"),
             "--session-start is only for .nwb",
         ),
+        (
+            ("fits.h5", "-o", "t.json", "--long"),
+            "t.json: --long is only for .csv and .parquet",
+        ),
+        (("fits.h5", "-o", "t.cir", "--all"), "t.cir: --all is only for .csv and .parquet"),
         (("fits.h5", "-o", "t.csv", "--path", "path 1"), "t.csv: --path is only for .cir and"),
         (("fits.h5", "-o", "t.cir"), "say which recording"),
         (("short.h5", "-o", "t.csv"), "chi2: the column is missing"),

@@ -262,8 +262,18 @@ def test_the_clock_may_start_beside_the_units(tmp_path):
     recordings, [used] = imported(path, told)
     np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 0.0535)
     assert str(used.signals["v_out"]).startswith("'CH2' in VOLT (file)")
+    assert used.rate_by == "mapping; file 200000 Hz"
     path.with_suffix(".h5").unlink()
+    refused(path, {**told, "sample_rate": 1e5}, "200000 Hz from the file")
     del told["sample_rate"]
+    _, [used] = imported(path, told)
+    assert (used.sample_rate, used.rate_by) == (2e5, "file")
+    path.with_suffix(".h5").unlink()
+    path.write_text("CH1(V),CH2(V),t0 =-6e-3, tInc = 5e-6,\n1,2\n3,4\n5,6\n", encoding="utf-8")
+    _, [used] = imported(path, told)
+    assert (used.sample_rate, used.rate_by) == (2e5, "file")
+    path.with_suffix(".h5").unlink()
+    path.write_text("X,CH1,CH2\nSequence,VOLT,VOLT\n0,1,2\n1,3,4\n", encoding="utf-8")
     refused(path, {**told, "time": {"channel": "X"}}, "the file says 'Sequence' of channel 'X'")
 
 

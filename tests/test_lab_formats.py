@@ -123,6 +123,74 @@ def test_a_long_record_is_split_at_its_pauses(tmp_path):
         assert one.path == f"long/{one.trial}"
 
 
+def in_turn(rests=(2000, 2000)):
+    """Four trains of three pulses: two electrodes in two rounds, and which one fires."""
+    trains = [pulses(3, before=before)[0] for before in (rests[0], 500, 500, 500)]
+    which = np.repeat([7.0, 12.0, 7.0, 12.0], [len(train) for train in trains])
+    th = np.concatenate([*trains, np.zeros(rests[1])])
+    level = np.where(which == 7, 0.5, 0.25)
+    out = th * np.append(level, np.zeros(rests[1]))
+    return {"th": th, "out": out, "which": np.append(which, np.zeros(rests[1]))}
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"split": "which", "electrode": "E{which}"},
+        {"split": "pulses", "electrode": ["E7", "E12"]},
+    ],
+)
+def test_electrodes_that_fire_in_turn_become_recordings_of_each(tmp_path, given):
+    np.savez(tmp_path / "a.npz", **in_turn())
+    recordings, _ = imported(tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, **given)
+    found = {one.path: (one.electrode, one.trial) for one in recordings}
+    assert found == {f"loaded/{e}/{n}": (e, n) for e in ("E7", "E12") for n in ("0", "1")}
+    for one in recordings:
+        assert round(one.periods, 2) == 3
+        level = {"E7": 0.5, "E12": 0.25}[one.electrode]
+        np.testing.assert_array_equal(one.v_out, level * one.v_th)
+
+
+def test_electrodes_may_fire_without_a_pause(tmp_path):
+    th = np.concatenate([pulses(6)[0], np.zeros(500)])
+    which = np.where(np.arange(th.size) < 3 * PERIOD, 1.0, 2.0)
+    out = th / 2
+    np.savez(tmp_path / "a.npz", th=th, out=out, which=which)
+    recordings, _ = imported(
+        tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="which",
+        electrode="E{which}",
+    )  # fmt: skip
+    assert [one.electrode for one in recordings] == ["E1", "E2"]
+    assert [round(one.periods, 1) for one in recordings] == [3, 3]
+
+
+@pytest.mark.parametrize(
+    ("rests", "given", "message"),
+    [
+        ((2000, 2000), {"electrode": ["E7", "E12"]}, "the list .*Give split too"),
+        ((2000, 2000), {"split": "pulses", "electrode": []}, "is the list"),
+        (
+            (2000, 2000),
+            {"split": "pulses", "electrode": ["E1", "E2", "E3"]},
+            "names 3 electrodes, but the record has 4 trains",
+        ),
+        ((0, 0), {"split": "pulses", "electrode": ["E7", "E12"]}, "cuts the first or the last"),
+        ((2000, 2000), {"split": "tilted", "electrode": "{tilted}"}, "is 3.75 at sample"),
+        ((2000, 2000), {"split": "what", "electrode": "E{what}"}, "there is no 'what'"),
+        (
+            (2000, 2000),
+            {"split": "which", "electrode": "E{which}", "trial": 3},
+            "1 labels for 4 trials",
+        ),
+    ],
+)
+def test_refusals_of_electrodes_in_turn(tmp_path, rests, given, message):
+    held = in_turn(rests)
+    np.savez(tmp_path / "a.npz", **held, tilted=held["which"] / 2 + 0.25)
+    with pytest.raises(RecordingError, match=message):
+        imported(tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, **given)
+
+
 def test_a_long_record_is_split_at_the_edges_of_a_trigger(tmp_path):
     th, out = long_record()
     trigger = np.zeros(th.size)

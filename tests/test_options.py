@@ -96,7 +96,7 @@ def test_a_circuit_string_is_its_circuit_wherever_a_circuit_is_taken(study):
 
 def test_all_functions_of_studies_take_the_same_options(study, source, fitted):
     """By default no driver is accepted; each function stores what it was asked for."""
-    asked = vars(stored(fitted)) | {"source": "", "source_size": 0}
+    asked = vars(stored(fitted)) | {"source": "", "source_sha256": ""}
     for found, method in (
         (etid.identify_study(study, method="maximum_likelihood", **OF_STUDY), "maximum_likelihood"),
         (etid.identify_jointly(study, **OF_STUDY), "joint"),

@@ -238,7 +238,8 @@ def test_fits_are_by_subject_and_failures_hollow():
         rf"${letter}_\mathrm{{{index}}}$ [{unit}]"
         for letter, index, unit in (("R", "s", "kΩ"), ("R", "p", "kΩ"), ("C", "p", "nF"))
     ]
-    points = [line for line in axes[0].lines if len(np.asarray(line.get_ydata()))]
+    lines = [line for line in axes[0].lines if len(np.asarray(line.get_ydata()))]
+    points = [line for line in lines if line.get_marker() != "_"]
     by_face = {
         hollow: np.concatenate(
             [
@@ -254,6 +255,24 @@ def test_fits_are_by_subject_and_failures_hollow():
     np.testing.assert_allclose(np.sort(by_face[False]), np.sort(values[good]))
     np.testing.assert_allclose(np.sort(by_face[True]), np.sort(values[~good]))
     assert [label.get_text() for label in axes[-1].get_xticklabels()] == ["s01", "s02"]
+    (medians,) = set(lines) - set(points)
+    groups = [one for one in fits.summary("subject", "condition") if one["successful"] > 2]
+    np.testing.assert_allclose(medians.get_ydata(), [one["r_s"] / 1e3 for one in groups])
+    (bars,) = axes[0].containers[-1][2]
+    lengths = [np.ptp(segment[:, 1]) for segment in bars.get_segments()]
+    np.testing.assert_allclose(lengths, [2e-3 * one["r_s_between"] for one in groups])
+
+
+def test_fits_are_by_any_two_labels():
+    fits = pictures.fits()
+    days = np.resize(np.array(["d1", "d2", "d3"], object), len(fits))
+    fits = dataclasses.replace(fits, labels={**fits.labels, "session": days})
+    axes = figure_of(fits, by=("session", "subject")).axes
+    assert [one.get_text() for one in axes[-1].get_xticklabels()] == ["d1", "d2", "d3"]
+    assert axes[-1].get_xlabel() == "session"
+    legend = axes[0].get_legend()
+    assert legend is not None
+    assert [one.get_text() for one in legend.get_texts()][:2] == ["s01", "s02"]
 
 
 def test_a_bound_shows_per_cent_and_what_is_undetermined():

@@ -82,6 +82,8 @@ etid.Fits.read('missing.h5') -> no such file
 realise(Rational(jnp.array([0.0, 0.001]), jnp.ones(1)), RATE) -> grows without bound
 figure_of(of.driver, show='residual') -> it is for fits, and one of 'pulse', 'impedance'
 etid.plot(of.driver, axes=new_figure(2, 2, (6.0, 5.0))[1][:1, 0]) -> 1 Axes; this picture takes 2
+figure_of(pictures.fits(), by='session') -> by is 'session', must be two labels
+figure_of(pictures.fits(), by=('session', 'day')) -> day: is no label
 save(figure_of(of.driver), 'figure.pdf') -> \.png or \.svg
 of.tracker.update(of.state, np.zeros((2, 3334))) -> shape \(2, 3334\).* \(2, 3333\)
 of.tracker.update(of.state, of.window, -1.0) -> finite and not negative
@@ -153,6 +155,7 @@ figure_of(pictures.fit()) -> plot\(fit, recording, driver\)
 figure_of(pictures.selection()) -> plot\(selection, recording, driver\)
 figure_of(of.driver, of.skin) -> no r_load
 figure_of('recording') -> cannot draw str
+figure_of(of.fit, by=('session', 'subject')) -> by is for Fits without a map
 figure_of({}) -> a dictionary of nothing
 """
 

@@ -289,14 +289,14 @@ def test_the_worst_are_of_every_verdict_and_of_every_reason():
     verdicts = ["successful"] * 20 + ["flat"] * 9 + ["misfit"] * 3 + ["saturated"]
     fits = fits_of(np.linspace(1.0, 2.0, 33), verdicts)
     cov = fits.cov.copy()
-    cov[5:8] *= 4.0
+    cov[5:7] *= 4.0
     fits = dataclasses.replace(fits, fit=dataclasses.replace(fits.fit, cov=cov))
     rows = list(worst(fits))
-    assert len(rows) == len(set(rows)) == 12
+    assert len(rows) == len(set(rows)) == 10
     # In turn flat, misfit, saturated, the largest χ² of each first: that grows with the row.
     assert rows[:6] == [28, 31, 32, 27, 30, 26]
-    assert rows[6:9] == [19, 18, 17]  # the largest χ² among the successful
-    assert sorted(rows[9:]) == [5, 6, 7]  # the largest standard errors
+    assert rows[6:8] == [19, 18]  # the largest χ² among the successful
+    assert sorted(rows[8:]) == [5, 6]  # the largest standard errors
     assert list(worst(fits_of([1.0], ["successful"]))) == [0]
 
 
@@ -349,7 +349,26 @@ def test_large_studies_are_condensed_and_say_so(tmp_path):
     assert f"Of {count // 5} subjects {figures.CROWD} are drawn" in page.text
     assert page.elements.count("tr") < 5 * tables.ROWS + tables.SINGLE
     assert f"{tables.SINGLE} of {count} recordings are shown" in page.text
-    assert "Electrodes" in page.text
+    assert "For maps, give the places of the electrodes: etid report --layout FILE." in page.text
+
+
+def test_electrodes_with_a_place_have_a_map_of_each_element_above_their_folded_table(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(figures, "MAPS", 2)
+    file, places = tmp_path / "fits.h5", tmp_path / "places.csv"
+    names = np.array(["A", "B"] * 3)
+    fits_of(
+        np.linspace(1.0, 2.0, 6), ["successful"] * 5 + ["flat"], electrode=names,
+        session=np.repeat(["d1", "d2", "d3"], 2),
+    ).write(file)  # fmt: skip
+    places.write_text("electrode,x,y\nA,0,0\nB,0.002,0\n", "utf-8")
+    assert cli.main(["report", str(file), "--layout", str(places)]) == 0
+    page = (tmp_path / "fits.html").read_text("utf-8")
+    drawn = re.findall(r'alt="Maps of (\w+)', page)
+    assert drawn == ["r_s", "r_p", "c_p"]
+    assert "2 of 3 maps are drawn" in page
+    assert page.index("Maps of c_p") < page.index("<summary>Table of 2 rows</summary>")
 
 
 def test_no_success_at_all_and_no_fit_at_all(tmp_path):

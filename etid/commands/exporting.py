@@ -27,6 +27,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="file to write; its suffix chooses the format",
     )
     parser.add_argument(
+        "--long", action="store_true", help="for .csv and .parquet: one line per element"
+    )
+    parser.add_argument(
+        "--all",
+        action="store_true",
+        help="for .csv and .parquet: also the columns of changes and of quality",
+    )
+    parser.add_argument(
         "--path", metavar="RECORDING", help="for .cir and .json: path of the recording"
     )
     parser.add_argument(
@@ -55,6 +63,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     for name in ("path", "circuit"):
         if getattr(arguments, name) is not None and suffix not in CIRCUITS:
             raise ValueError(f"{target}: --{name} is only for {' and '.join(CIRCUITS)}")
+    for name in ("long", "all"):
+        if getattr(arguments, name) and suffix not in TABLES:
+            raise ValueError(f"{target}: --{name} is only for {' and '.join(TABLES)}")
     if arguments.session_start is not None and suffix != ".nwb":
         raise ValueError(f"{target}: --session-start is only for .nwb")
     if suffix == ".nwb":
@@ -62,5 +73,5 @@ def run(arguments: argparse.Namespace) -> Outcome:
     elif suffix in CIRCUITS:
         export_circuit(source, target, arguments.path, circuit=arguments.circuit)
     else:
-        export_fits(source, target)
+        export_fits(source, target, long=arguments.long, all=arguments.all)
     return Outcome(str(target), {"source": source, "target": target})

@@ -39,12 +39,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_circuit(parser, "circuit of the loads, default SkinRC", automatic=True)
     parser.add_argument(
+        "--driver",
+        type=pathlib.Path,
+        metavar="DRIVER",
+        help="file of the driver of all recordings, from etid calibrate",
+    )
+    parser.add_argument(
         "--order",
         type=_order,
-        default=5,
         metavar="N",
         help="number of poles of the driver, or auto: the least that the calibrations support; "
-        "default 5",
+        "default 5, with --driver auto",
     )
     parser.add_argument(
         "--fix",
@@ -208,8 +213,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ValueError(
             "--r-load-tolerance enters the standard errors of joint fits; add --joint, or remove it"
         )
+    if arguments.joint and arguments.driver:
+        raise ValueError("--joint identifies the driver itself; remove --driver, or --joint")
     options = {
-        "order": arguments.order,
         "circuit": None if arguments.circuit is None else arguments.circuit(),
         "fixed": _several("--fix", arguments.fix, 1),
         "prior": _several("--prior", arguments.prior, 2),
@@ -224,6 +230,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             outcome = identify_jointly(
                 study,
                 **options,
+                order=5 if arguments.order is None else arguments.order,
                 r_load_tolerance=arguments.r_load_tolerance,
                 progress=progress,
             )
@@ -238,6 +245,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 arguments.source,
                 arguments.target,
                 **options,
+                driver=arguments.driver,
+                order=arguments.order,
                 method=arguments.method,
                 driver_drift=arguments.driver_drift,
                 instrument=_instrument(arguments.tolerance),

@@ -5,11 +5,12 @@ import pathlib
 
 from etid.commands import Outcome
 from etid.commands.circuits import add_circuit
+from etid.plotting.layout import FINGERTIP, read_layout
 from etid.report.study import write_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments: the fits, the page, the recordings, and the circuit."""
+    """Add the arguments: the fits, the page, the recordings, the layout, and the circuit."""
     parser.add_argument("fits", type=pathlib.Path, metavar="FITS")
     parser.add_argument(
         "-o",
@@ -23,6 +24,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=pathlib.Path,
         metavar="FILE",
         help="recordings, for figures of the worst fits; default: the file that was fitted",
+    )
+    parser.add_argument(
+        "--layout",
+        type=pathlib.Path,
+        metavar="FILE",
+        help="places of the electrodes, for maps: columns electrode, x, y [m], or a probe file; "
+        "default: the paper's display, E1 to E98",
     )
     add_circuit(parser, "circuit of the fits, if it is not a circuit of etid")
 
@@ -39,5 +47,7 @@ def _page(arguments: argparse.Namespace) -> pathlib.Path:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Write the page and return its path."""
     page = _page(arguments)
-    write_report(arguments.fits, page, recordings=arguments.recordings, circuit=arguments.circuit)
+    layout = FINGERTIP if arguments.layout is None else read_layout(arguments.layout)
+    given = {"recordings": arguments.recordings, "circuit": arguments.circuit, "layout": layout}
+    write_report(arguments.fits, page, **given)
     return Outcome(str(page), {"fits": arguments.fits, "page": page})

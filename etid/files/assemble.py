@@ -17,7 +17,7 @@ from etid.files.mapping import KINDS, PAUSES, Plan, Signal, unit_of
 from etid.recordings import limits
 from etid.recordings.fields import SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, RecordingError
-from etid.recordings.splitting import split
+from etid.recordings.splitting import firing, split
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,9 +130,11 @@ def sources_of(
             field="v_out",
             remedy="Rows are trials, columns are times: transpose the variables",
         )
-    parts = _parts(plan, channels, channel, common)
+    parts, electrodes = _parts(plan, channels, channel, common)
     several = stacked or bool(parts)
     trials = list(range(len(parts))) if parts else trials
+    if electrodes:  # the trials are the rounds of each
+        trials = [electrodes[:i].count(one) for i, one in enumerate(electrodes)]
     labels = _labels(plan.fields.get("trial"), trials, several)
     sources: dict[str, AbstractSource] = {}
     for index, label in enumerate(labels):
@@ -141,13 +143,17 @@ def sources_of(
         for name in SIGNALS:
             if name in channels:
                 factor = units[name][0].factor / (plan.signals[name].scale or 1.0)
-                own = channels[name].part(parts[index]) if parts else channels[name]
+                part = channels[name].part(parts[index]) if parts else channels[name]
                 trial = rows[name][index if len(rows[name]) > 1 else 0]
                 with located("", field=name):
-                    layout.append(_layout(name, own, factor))
-                records[name] = own, trial
+                    layout.append(_layout(name, part, factor))
+                records[name] = part, trial
         path = f"{plan.path}/{index}" if several or plan.path in KINDS else plan.path
-        metadata = metadata_from(**{**vars(common), "trial": label, "path": path})
+        own = {"trial": label, "path": path}
+        if electrodes:
+            own["electrode"] = electrodes[index]
+            own["path"] = path = f"{plan.path}/{electrodes[index]}/{trials[index]}"
+        metadata = metadata_from(**{**vars(common), **own})
         th = records.get("v_th")
         unloaded = (file, path) if th is None else (file, th[0].name, th[1])
         sources[path] = _Source(tuple(layout), unloaded, file, metadata, records)
@@ -185,10 +191,13 @@ def _parts(
     channels: Mapping[str, Channel],
     channel: Callable[[str], Channel],
     common: Metadata,
-) -> list[slice]:
-    """The trials of one long record; empty if it is not to be split."""
+) -> tuple[list[slice], list[str]]:
+    """The parts of one long record, and their electrodes if these fire in turn.
+
+    Both are empty if the record is not to be split.
+    """
     if not plan.split:
-        return []
+        return [], []
     by_pulses = plan.split == PAUSES
     if by_pulses and "v_th" not in channels:
         raise RecordingError(
@@ -209,8 +218,22 @@ def _parts(
         return np.concatenate(list(own.blocks())).astype(float)
 
     cause = channels["v_th"] if "v_th" in channels else channels["current"]
-    trigger = None if by_pulses else samples(separating)
-    return split(samples(cause), common.sample_rate, common.pulse_rate, trigger)
+    more = None if by_pulses else samples(separating)
+    order, rates = plan.electrodes, (common.sample_rate, common.pulse_rate)
+    if plan.numbered and more is not None:
+        parts = split(samples(cause), *rates, which=more)
+        period = rates[0] / rates[1]
+        starts = np.array([part.start + round(period / 5) for part in parts])
+        numbers = firing(more, starts, period)
+        return parts, [order[0].replace(f"{{{plan.split}}}", str(number)) for number in numbers]
+    parts = split(samples(cause), *rates, more, cut=not order)
+    if order and len(parts) % len(order):
+        raise RecordingError(
+            f"names {len(order)} electrodes, but the record has {len(parts)} trains of pulses",
+            field="electrode",
+            remedy="Name them in the order in which they fire, and record whole rounds",
+        )
+    return parts, [order[i % len(order)] for i in range(len(parts))] if order else []
 
 
 def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:

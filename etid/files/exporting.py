@@ -2,11 +2,12 @@
 
 import csv
 import datetime
+import itertools
 import json
 import os
 import pathlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -22,14 +23,22 @@ from etid.recordings.replacing import replace_text, replacing
 from etid.recordings.untrusted import attribute, translated
 from etid.results.fit import Fit
 from etid.results.fits import DESCRIBED, SCHEMA, Fits
+from etid.results.fits_columns import long_form
 from etid.results.hdf5_table import REMEDY, Table, opened_table, same_length
 
 ROWS = 1 << 16  # fits in memory at a time
+QUALITY = ("rrse", "chi2", "steps", "remarks")
 CIRCUITS = (".cir", ".json")
 
 
-def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
-    """Write the table of a file of fits, `Fits.table()`, for other programs.
+def export_fits(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    long: bool = False,
+    all: bool = False,
+) -> None:
+    """Write the table of a file of fits for other programs: labels, elements ±, verdicts, notes.
 
     - `.csv`: one line of column names, such as `r_s [ohm]` and `r_s_stderr [ohm]`, then one line
       per fit. Numbers are in SI units with all digits. An unknown number is `nan`. A text that
@@ -43,6 +52,9 @@ def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
     Args:
         source: File of fits.
         target: File to write. An existing file is replaced at the end.
+        long: As in `Fits.table`: one line per element.
+        all: Write all columns of `Fits.table()`: also the changes of the elements, χ² and other
+            columns of quality.
 
     Raises:
         ValueError: The source is not a file of fits, or the target has another suffix.
@@ -54,13 +66,22 @@ def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
             f"{os.fspath(target)}: fits are exported as {' or '.join(TABLES)}, not {suffix!r}"
         )
     with opened_table(source, SCHEMA) as table, replacing(target) as partial:
-        columns = _columns(table)
+        names = _elements(table)
+        columns = _columns(table, names)
+        if not all:
+            more = {f"{name}_change" for name in (*names, "amplitude")} | {*QUALITY}
+            columns = {name: column for name, column in columns.items() if name not in more}
+        units = {name: _units(column, table) for name, column in columns.items()}
+        parts = _parts(table, columns)
+        if long:
+            of = {name: units[name] or "1" for name in names}
+            parts = (long_form(part, of) for part in parts)
         about = {name: table.text(name) for name in ("circuit", "method", "etid_version")}
-        TABLES[suffix](table, columns, about, partial)
+        TABLES[suffix](parts, units, about, partial)
 
 
-def _columns(table: Table) -> dict[str, h5py.Dataset]:
-    """The columns of `Fits.table()` as HDF5 datasets that are not read yet."""
+def _elements(table: Table) -> list[str]:
+    """Names of the elements."""
     parameters = table.attribute("parameters")
     names = parameters if isinstance(parameters, list) else [parameters]
     if not all(isinstance(name, str) for name in names) or len(names) > limits.NAMES:
@@ -68,6 +89,11 @@ def _columns(table: Table) -> dict[str, h5py.Dataset]:
             f"is {parameters!r}, must be names", file=table.name, field="parameters",
             remedy=REMEDY,
         )  # fmt: skip
+    return [str(name) for name in names]
+
+
+def _columns(table: Table, names: Sequence[str]) -> dict[str, h5py.Dataset]:
+    """The columns of `Fits.table()` as HDF5 datasets that are not read yet."""
     elements = [name + ending for name in names for ending in ("", "_stderr")]
     changes = (f"{name}_change" for name in (*names, "amplitude"))
     elements += [
@@ -91,23 +117,24 @@ def _units(column: h5py.Dataset, table: Table) -> str | None:
 
 
 def _parts(table: Table, columns: dict[str, h5py.Dataset]) -> Iterator[dict[str, np.ndarray]]:
-    """The columns in parts of `ROWS` rows."""
-    for start in range(0, len(columns["path"]), ROWS):
+    """The columns in parts of `ROWS` rows; one part without rows if there are no fits."""
+    for start in range(0, max(1, len(columns["path"])), ROWS):
         rows = slice(start, start + ROWS)
         yield {name: table.read(column, rows) for name, column in columns.items()}
 
 
-def _csv(
-    table: Table, columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path
-) -> None:
+_Part = dict[str, np.ndarray]
+_Units = Mapping[str, str | None]
+
+
+def _csv(parts: Iterator[_Part], units: _Units, about: dict[str, str], path: pathlib.Path) -> None:
     del about
-    units = {name: _units(column, table) for name, column in columns.items()}
     with path.open("w", newline="", encoding="utf-8") as text:
         lines = csv.writer(text)
-        lines.writerow(
-            name if unit in (None, "1") else f"{name} [{unit}]" for name, unit in units.items()
-        )
-        for part in _parts(table, columns):
+        first = next(parts)
+        known = [(name, units.get(name)) for name in first]
+        lines.writerow(name if unit in (None, "1") else f"{name} [{unit}]" for name, unit in known)
+        for part in itertools.chain([first], parts):
             cells = ([_cell(item) for item in column.tolist()] for column in part.values())
             lines.writerows(zip(*cells, strict=True))
 
@@ -122,19 +149,20 @@ def _cell(value: str | float | int) -> str | float | int:
 
 
 def _parquet(
-    table: Table, columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path
+    parts: Iterator[_Part], units: _Units, about: dict[str, str], path: pathlib.Path
 ) -> None:
     pyarrow = optional("pyarrow", "parquet", str(path))
     parquet = optional("pyarrow.parquet", "parquet", str(path), "pyarrow")
     fields = []
-    for name, column in columns.items():
-        text = h5py.check_string_dtype(column.dtype)
+    first = next(parts)
+    for name, column in first.items():
+        text = column.dtype.kind in "OU"
         kind: Any = pyarrow.string() if text else pyarrow.from_numpy_dtype(column.dtype)
-        unit = _units(column, table)
+        unit = units.get(name)
         fields.append(pyarrow.field(name, kind, metadata={"unit": unit} if unit else None))
     schema = pyarrow.schema(fields, metadata=about)
     with parquet.ParquetWriter(path, schema) as writer:
-        for part in _parts(table, columns):
+        for part in itertools.chain([first], parts):
             writer.write_table(pyarrow.table(part, schema=schema))
 
 

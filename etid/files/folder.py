@@ -9,7 +9,6 @@ listed.
 The table `calibrations.csv` of a folder, with the columns `file` and `ohm`, names resistors too.
 """
 
-import csv
 import dataclasses
 import os
 import pathlib
@@ -26,6 +25,7 @@ from etid.files.pattern import Pattern
 from etid.recordings.errors import RecordingError
 from etid.recordings.fields import LABELS, real
 from etid.recordings.replacing import replacing
+from etid.recordings.tables import rows_of
 
 TABLE = "calibrations.csv"
 _RESISTANCE = re.compile(r"(\d+)([RkM])(\d*)|(\d+(?:\.\d+)?)([RkM]?)")
@@ -95,8 +95,11 @@ def import_folder(
     root = pathlib.Path(os.fspath(folder))
     found, unmatched = labelled(root, [labels] if isinstance(labels, str) else labels)
     common = channels_of({name: value for name, value in given.items() if value is not None})
+    turns = {name: common.pop(name) for name in ("split", "electrode") if name in common}
     tables = {file: {**of, "path": _path(of)} for file, of in found.items()}
     for file, of in tables.items():
+        if "r_load" not in of:  # calibrations are not split
+            of.update(turns)
         names = _calibrations(file, of, tables)
         if names:
             of["calibration"] = names
@@ -186,17 +189,13 @@ def _table(root: pathlib.Path) -> dict[str, float]:
     table = root / TABLE
     if not table.is_file():
         return {}
-    with located(str(table)), table.open(encoding="utf-8-sig", newline="") as lines:
-        rows = list(csv.DictReader(lines, skipinitialspace=True))
-        if not rows or not {"file", "ohm"} <= rows[0].keys():
-            raise RecordingError("must have the columns file and ohm, and a row for each file")
+    with located(str(table)):
         found = {}
-        for row in rows:
-            file, ohm = str(row["file"]).strip(), str(row["ohm"]).strip()
+        for row in rows_of(table, ("file", "ohm")):
             try:
-                found[file] = real("ohm", float(ohm))
+                found[row["file"]] = real("ohm", float(row["ohm"]))
             except ValueError:
-                found[file] = resistance(ohm, str(table))
+                found[row["file"]] = resistance(row["ohm"], str(table))
         return found
 
 

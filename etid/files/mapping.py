@@ -55,14 +55,22 @@ class Plan:
         path: HDF5 path.
         signals: `v_out`, `v_th` or `current` or both, and `time` if the mapping names it.
         fields: All other keys of the mapping except `path`, `scale` and `split`.
-        split: `PAUSES`, or the channel of a trigger, if trials are parts of one long record; empty
-            otherwise.
+        split: `PAUSES`, or the channel of a trigger or of the number of the electrode, if trials
+            are parts of one long record; empty otherwise.
+        electrodes: Electrodes that fire in turn, in the order of the parts; or one name with the
+            channel of the number in braces, such as `E{which}`; empty if all parts are of one.
     """
 
     path: str
     signals: Mapping[str, Signal]
     fields: Mapping[str, Any]
     split: str = ""
+    electrodes: tuple[str, ...] = ()
+
+    @property
+    def numbered(self) -> bool:
+        """Whether the channel `split` has the number of the electrode."""
+        return any(f"{{{self.split}}}" in name for name in self.electrodes)
 
     @property
     def channels(self) -> set[str]:
@@ -249,12 +257,6 @@ def _plan(
             "is given together with time: one of time and sample_rate is needed, not both",
             field="sample_rate",
         )
-    # The trial of a stack is a list of labels; `sources_of` checks each label.
-    fields = {
-        name: value if name == "trial" else DECLARED[name].checked(value)
-        for name, value in said.items()
-        if name in DECLARED
-    }
     split = said.get("split", "")
     if not isinstance(split, str):
         raise RecordingError(
@@ -262,7 +264,29 @@ def _plan(
         )
     if split not in ("", PAUSES):
         chosen(names, split, "split")
-    return Plan(path, signals, fields, split)
+    electrodes = _electrodes(said.get("electrode"), split)
+    said = {name: value for name, value in said.items() if name != "electrode" or not electrodes}
+    # The trial of a stack is a list of labels; `sources_of` checks each label.
+    fields = {
+        name: value if name == "trial" else DECLARED[name].checked(value)
+        for name, value in said.items()
+        if name in DECLARED
+    }
+    return Plan(path, signals, fields, split, electrodes)
+
+
+def _electrodes(said: Any, split: str) -> tuple[str, ...]:
+    """The electrodes that fire in turn within one record; empty if it is of one electrode."""
+    several = isinstance(said, list)
+    if not several and not (isinstance(said, str) and f"{{{split}}}" in said):
+        return ()
+    if several and (not split or not said):
+        raise RecordingError(
+            f"is the list {said!r}: the electrodes of the parts of one long record, in turn",
+            field="electrode",
+            remedy=f"Give split too, {PAUSES!r} or the channel of a trigger",
+        )
+    return tuple(DECLARED["electrode"].checked(one) for one in (said if several else [said]))
 
 
 def _missing(name: str, known: str = "", hint: str = "") -> RecordingError:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import logging
 import operator
 from collections.abc import Sequence
 
@@ -20,6 +21,7 @@ from etid.identify.options import Options, check_instrument, check_order, for_ca
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
+from etid.recordings.causes import LOG, log_changes
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
@@ -123,6 +125,8 @@ def calibrated(
         driver = _of_least_order(seen, estimator)
     else:
         driver = _driver(seen, options.order, estimator)
+    for one in seen:
+        log_changes(one)
     remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
     driver = dataclasses.replace(driver, remarks=np.asarray(int(remarks) | int(driver.remarks)))
     if isinstance(driver, HarmonicDriver):
@@ -142,6 +146,11 @@ def calibrated(
     size = abs(at_1_khz)
     if np.isfinite(size) and not options.plausible[0] <= size <= options.plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
+    if LOG.isEnabledFor(logging.INFO):
+        tried = f"; {driver.tried}" if isinstance(driver, ContinuousDriver) else ""
+        LOG.info(
+            "%s: %s", seen[0].recording.path, f"{driver._overview().title}{tried}".rstrip("; ")
+        )
     if throw and driver.verdict != "successful":
         found = f"{driver.verdict}, |Z_th| is {size:.3g} ohm at 1 kHz"
         raise IdentificationError(f"driver: {found}. {message(driver.verdict)}", driver)

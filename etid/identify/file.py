@@ -33,10 +33,11 @@ from etid.estimators.registry import Method
 from etid.identify.options import Circuit, Interval, Options, candidates_of
 from etid.identify.study import Drivers, common_first, identify_part
 from etid.precision import in_float64
-from etid.recordings.hdf5 import read
+from etid.recordings.hdf5 import read, read_with_driver
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import claimed, replace_text
-from etid.results.driver import Order
+from etid.recordings.study import Study
+from etid.results.driver import AUTO, Order
 from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 
@@ -48,10 +49,15 @@ class ResumeError(ValueError):
 
 
 @functools.cache
-def _kept_open(source: str, stamp: int, options: Options) -> Drivers:
-    """A file in use, for the lifetime of the process: a worker gets its parts one by one."""
-    del stamp
-    return Drivers(read(source), options)
+def _kept_open(sources: tuple[str, ...], stamps: tuple[int, ...], options: Options) -> Drivers:
+    """Files in use, for the lifetime of the process: a worker gets its parts one by one."""
+    del stamps
+    return Drivers(_opened(sources), options)
+
+
+def _opened(sources: tuple[str, ...]) -> Study:
+    """A file of recordings, or one with the file of its driver."""
+    return read_with_driver(*sources) if len(sources) > 1 else read(*sources)
 
 
 def _fit(drivers: Drivers, options: Options, size: int, number: int) -> StudyFits:
@@ -71,9 +77,11 @@ def _fit(drivers: Drivers, options: Options, size: int, number: int) -> StudyFit
 
 
 @in_float64
-def _fit_elsewhere(source: str, stamp: int, options: Options, size: int, number: int) -> StudyFits:
-    """The fits of one part, in any process that can read the file."""
-    return _fit(_kept_open(source, stamp, options), options, size, number)
+def _fit_elsewhere(
+    sources: tuple[str, ...], stamps: tuple[int, ...], options: Options, size: int, number: int
+) -> StudyFits:
+    """The fits of one part, in any process that can read the files."""
+    return _fit(_kept_open(sources, stamps, options), options, size, number)
 
 
 def _pin(cores: Any) -> None:
@@ -146,7 +154,8 @@ def fit_file(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     *,
-    order: Order = 5,
+    driver: str | os.PathLike[str] | None = None,
+    order: Order | None = None,
     circuit: Circuit = None,
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
@@ -164,7 +173,9 @@ def fit_file(
     Args:
         source: File of recordings. Every process of `executor` must find it under this name.
         target: File of fits to write. Until it is complete, its parts are in `target.parts`.
-        order: As in `identify_driver`.
+        driver: File of the driver of all recordings, as `CheckedCalibration.write` writes it, in
+            place of the calibrations of the source.
+        order: As in `identify_driver`; default 5, with `driver` `"auto"` as in `read_driver`.
         circuit: As in `identify_skins`. With `"auto"` a sample of the recordings chooses it.
         method: As in `identify_skin`.
         fixed: As in `identify_skin`, for all recordings.
@@ -184,8 +195,8 @@ def fit_file(
     Raises:
         ResumeError: The earlier run had other settings, the source has changed since, or a worker
             was lost.
-        RecordingError: The source as a whole is missing, damaged or of another schema, or another
-            process is writing the target.
+        RecordingError: The source as a whole is missing, damaged or of another schema, `driver`
+            has calibrations of no driver or of several, or another process is writing the target.
         ValueError: The source has no loaded recording.
     """
     options = Options.of(
@@ -194,24 +205,26 @@ def fit_file(
         fixed=fixed,
         prior=prior,
         bounds=bounds,
-        order=order,
+        order=order if order is not None else 5 if driver is None else AUTO,
         driver_drift=driver_drift,
         instrument=instrument,
         plausible=plausible,
     )
-    source, target = os.path.abspath(source), pathlib.Path(target)
-    study = read(source)
+    target = pathlib.Path(target)
+    sources = tuple(os.path.abspath(one) for one in (source, driver) if one is not None)
+    study = _opened(sources)
     drivers = Drivers(study, options)
     with study, claimed(target):
         count = len(drivers.paths)
         numbers = range((count + PART - 1) // PART)
-        stamp = os.stat(source).st_mtime_ns
+        stamps = tuple(os.stat(one).st_mtime_ns for one in sources)
         options = common_first(drivers, options)
         settings = options.settings(study, count)
+        settings = dataclasses.replace(settings, driver=" ".join(sources[1:]))
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
             **{name.replace("_", " "): value for name, value in described.items()},
-            "source date": stamp,
+            "source date": list(stamps),
             "circuit": hashlib.sha256(
                 " ".join(
                     f"{class_path(type(one))} {eqx.tree_pformat(one)}" for one in options.circuits
@@ -223,7 +236,7 @@ def fit_file(
         left = [number for number in numbers if not parts.path(number).exists()]
         task = functools.partial(_fit, drivers, options, PART)
         if executor is not None:
-            task = functools.partial(_fit_elsewhere, source, stamp, options, PART)
+            task = functools.partial(_fit_elsewhere, sources, stamps, options, PART)
         identified = {}
         done = min(count, (len(numbers) - len(left)) * PART)
         with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:

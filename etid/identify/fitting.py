@@ -10,6 +10,7 @@ its fit misses, without the mains harmonics.
 
 import dataclasses
 import functools
+import logging
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -34,6 +35,7 @@ from etid.estimators.lanes import (
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.identify import changes
 from etid.numpy_tier.tiers import program, worth_compiling
+from etid.recordings.causes import LOG, log_changes
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
@@ -365,6 +367,10 @@ def judged(
     """
     remarks = [remarks_on(one, estimator) for one in seen]
     found = found.concluded(driver, remarks, repeats(seen))
+    for row in range(len(found)) if LOG.isEnabledFor(logging.INFO) else ():
+        tried, fit = len(found[row]), found[row][found.chosen(row)]
+        best_of = f", best of {tried} circuits" if tried > 1 else ""
+        LOG.info("%s: %s", seen[row].recording.path, f"{fit._overview().title}{best_of}")
     if not (isinstance(estimator, MaximumLikelihood) and estimator.with_current):
         return found
     by_current = [of for one in seen if (of := one.by_current) is not None]
@@ -413,6 +419,7 @@ def notes_of(fits: Fit) -> list[str]:
 
 def remarks_on(seen: Inspected, estimator: AbstractEstimator) -> int:
     """Remarks on a recording, also that the estimator leaves out a current beside a driver."""
+    log_changes(seen)
     uses = isinstance(estimator, MaximumLikelihood) and estimator.with_current
     unused = seen.by_current is not None and not uses
     return int(seen.remarks | (Remark.current_unused if unused else 0))

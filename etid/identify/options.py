@@ -40,7 +40,7 @@ from etid.recordings.study import Study
 from etid.results.driver import AUTO, ContinuousDriver, HarmonicDriver, Order
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.instrument import Instrument
-from etid.results.study_fits import PLAUSIBLE, Settings, versions
+from etid.results.study_fits import PLAUSIBLE, Settings, sha256, versions
 from etid.selection.search import usual_circuits
 
 Circuit = AbstractCircuit | str | None
@@ -171,7 +171,7 @@ class Options:
         several = len(self.circuits) > 1
         return Settings(
             source=source,
-            source_size=os.path.getsize(source) if source else 0,
+            source_sha256=sha256(source) if source else "",
             recordings=count,
             asked_method=method or str(self.estimator or ""),
             order=0 if self.order == AUTO else self.order,

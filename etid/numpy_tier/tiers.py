@@ -95,11 +95,12 @@ def program(
         return found, _Static(others)
 
     flat.__name__ = flat.__qualname__ = function.__name__
-    part = jax.jit(flat, static_argnums=0)  # of another function, which decides who runs it
+    # To run by NumPy, or as part of another function, which decides who runs it.
+    part = jax.jit(flat, static_argnums=0)
 
     @functools.cache
     def compiled(processor: bool) -> Any:
-        options = None if not processor else QUICKLY if batch else AT_ONCE
+        options = {} if not processor else _known(QUICKLY if batch else AT_ONCE)
         return jax.jit(flat, static_argnums=0, compiler_options=options)
 
     @functools.wraps(function)
@@ -110,13 +111,29 @@ def program(
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arrays)):
             found, others = part(static, arrays)
             return eqx.combine(found, others.of)
-        run = compiled(jax.default_backend() == "cpu")
         with _at_once():
-            small = None if batch or not _by_numpy() else _in_numpy(run, static, arrays)
-            found, others = small(arrays) if small else _by_xla(run, static, arrays)
+            small = None if batch or not _by_numpy() else _in_numpy(part, static, arrays)
+            if small:
+                found, others = small(arrays)
+            else:
+                run = compiled(jax.default_backend() == "cpu")
+                found, others = _by_xla(run, static, arrays)
         return eqx.combine(found, others.of)
 
     return call
+
+
+def _known(options: dict[str, Any]) -> dict[str, Any]:
+    """Those of the options that this version of XLA has; others would end the compilation."""
+
+    def is_known(name: str) -> bool:
+        try:
+            jax.jit(lambda: 0, compiler_options={name: options[name]}).lower().compile()
+        except jax.errors.JaxRuntimeError:
+            return False
+        return True
+
+    return {name: value for name, value in options.items() if is_known(name)}
 
 
 def worth_compiling(numbers: int) -> bool:
@@ -137,10 +154,10 @@ def _by_xla(run: Any, static: _Static, arrays: Any) -> Any:
         return run(static, arrays)
 
 
-def _in_numpy(run: Any, static: _Static, arrays: Any) -> Any:
-    """The compiled function as one of NumPy; None if it has a primitive that NumPy cannot run."""
+def _in_numpy(part: Any, static: _Static, arrays: Any) -> Any:
+    """The function as one of NumPy; None if it has a primitive that NumPy cannot run."""
     with unsearched():
-        traced = run.trace(static, arrays)
+        traced = part.trace(static, arrays)
         jaxpr = traced.jaxpr.jaxpr  # the same object each time, because JAX keeps its traces
         if jaxpr not in _programs:
             try:

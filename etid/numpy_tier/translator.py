@@ -159,7 +159,10 @@ class Translator:
             return values[var]
 
         for equation in jaxpr.eqns:
-            found = self.equation(equation, [read(var) for var in equation.invars])
+            try:
+                found = self.equation(equation, [read(var) for var in equation.invars])
+            except KeyError as error:  # a version of JAX that names a parameter in another way
+                raise UntranslatableError(f"{equation.primitive}, without {error}") from error
             values |= zip(equation.outvars, found, strict=True)
         return [read(var) for var in jaxpr.outvars]
 
@@ -273,7 +276,11 @@ class Translator:
     def scan(self, equation: Equation, operands: Sequence[Value]) -> Sequence[Value]:
         """Results of a loop over rows."""
         params, avals = equation.params, [var.aval for var in equation.outvars]
-        first, count, program = params["num_consts"], params["num_carry"], params["jaxpr"]
+        program = params["jaxpr"]
+        if "ft_in" in params:  # from JAX 0.11 on
+            first, count, _ = (len(list(of)) for of in params["ft_in"].update(operands).unpack())
+        else:
+            first, count = params["num_consts"], params["num_carry"]
         body = self.nested(program, operands[:first], program.in_avals[first:], 1)
         steps = range(params["length"])[:: -1 if params["reverse"] else 1]
         run = partial(scan, steps=steps, length=count, avals=avals[count:])

@@ -42,7 +42,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
@@ -372,10 +372,7 @@ class Tracker(Overviewed):
         Args:
             state: State of the tracker.
         """
-        logs = state.electrodes.own[:, :-1]
-        lowest = self.model.bands.frequency[:1]
-        z = jax.vmap(lambda one: self.model.circuit.with_log_values(one).response(lowest)[0])(logs)
-        return bad_electrodes(state, np.abs(np.asarray(z)))
+        return bad_electrodes(state, np.abs(np.asarray(_lowest(self.model, state.electrodes.own))))
 
 
 @program
@@ -383,3 +380,10 @@ def _judged(model: GainModel, driver_result: RESULTS, state: TrackerState) -> Fi
     return jax.vmap(lambda of: fit_of(model, driver_result, state.driver_changed, of))(
         state.electrodes
     )
+
+
+@jax.jit  # as `etid.online.tick.updated`
+def _lowest(model: GainModel, own: Float[Array, "lane own"]) -> Complex[Array, " lane"]:
+    """Impedance of each load at the lowest frequency [Ω]."""
+    lowest = model.bands.frequency[:1]
+    return jax.vmap(lambda one: model.circuit.with_log_values(one[:-1]).response(lowest)[0])(own)

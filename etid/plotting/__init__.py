@@ -4,7 +4,7 @@
 matplotlib.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_args, overload
 
 import numpy as np
@@ -61,6 +61,7 @@ def plot(
     *,
     axes: AnyAxes = None,
     title: str | None = "",
+    by: Sequence[str] | None = None,
     map: str | None = None,
     layout: "Layout | None" = None,
 ) -> np.ndarray: ...
@@ -80,6 +81,7 @@ def plot(
     axes: AnyAxes = None,
     title: str | None = "",
     show: Shown = "pulse",
+    by: Sequence[str] | None = None,
     map: str | None = None,
     layout: "Layout | None" = None,
 ) -> np.ndarray:
@@ -102,6 +104,7 @@ def plot(
     | `plot(posterior)` | each element, and each two of them, beside the errors of the fit | n² |
     | `plot(profile)` | how much worse the fit becomes if one element has another value | 1 |
     | `plot(fits)` | each element by subject, conditions side by side | one per element |
+    | `plot(fits, by=("session", "subject"))` | each element by two other labels | the same |
     | `plot(fits, map="r_p")` | an element at each electrode of a display | one per group |
     | `plot(etid.bound(scene))` | smallest relative standard errors [%] of each recording | 1 |
 
@@ -125,6 +128,9 @@ def plot(
             `identify_skin` knows its recording and its driver; one of several fits does not.
         driver: Driver of the fit or selection, if `recording` is given.
         show: What to draw of a fit: `"pulse"`, `"impedance"` or `"residual"`.
+        by: Two labels: that of the horizontal axis, and that of the series side by side; default
+            subject and condition. Medians of three fits or more are thick, with the variation
+            between fits beyond their errors.
         map: Element to draw at each electrode of a display, a map for each subject, session, site
             and condition. An electrode without a successful trial has a mark for its verdict.
         layout: Places of the electrodes; if not given, `E1` to `E98` of the paper's display.
@@ -142,7 +148,7 @@ def plot(
     from etid.plotting import style
 
     canvas = style.on_pyplot if axes is None else style.on_axes(axes)
-    drawn = _draw(canvas, x, recording, driver, show, map, layout)
+    drawn = _draw(canvas, x, recording, driver, show, by, map, layout)
     if title != "":
         for axis in drawn.flat:
             axis.set_title("", loc="left")
@@ -155,6 +161,7 @@ def figure_of(
     recording: Recording | None = None,
     driver: Driver | None = None,
     show: Shown = "pulse",
+    by: Sequence[str] | None = None,
     map: str | None = None,
     layout: "Layout | None" = None,
 ) -> "matplotlib.figure.Figure":
@@ -164,7 +171,7 @@ def figure_of(
     def canvas(*grid: Any, **options: Any) -> np.ndarray:
         return style.new_figure(*grid, **options)[1]
 
-    return _draw(canvas, x, recording, driver, show, map, layout)[0].figure
+    return _draw(canvas, x, recording, driver, show, by, map, layout)[0].figure
 
 
 @np.errstate(all="ignore")  # a fit that failed may hold any number
@@ -174,6 +181,7 @@ def _draw(
     recording: Recording | None,
     driver: Driver | None,
     show: Shown,
+    by: Sequence[str] | None,
     element: str | None,
     layout: "Layout | None",
 ) -> np.ndarray:
@@ -189,6 +197,8 @@ def _draw(
     is_map = element is not None or layout is not None
     if is_map and (element is None or not isinstance(x, Fits)):
         raise TypeError("map is for Fits, and layout for a map: plot(fits, map='r_p')")
+    if by is not None and (is_map or not isinstance(x, Fits)):
+        raise TypeError("by is for Fits without a map: plot(fits, by=('session', 'subject'))")
     if isinstance(x, Fit):
         recording, driver = x.source_or_own(recording, driver)
         if recording is None and x.measured is not None and show == "residual":
@@ -224,7 +234,7 @@ def _draw(
             case Fits(), None, None if element is not None:
                 return maps.draw_map(canvas, x, element, layout or FINGERTIP)
             case Fits(), None, None:
-                return elements.draw_fits(canvas, x)
+                return elements.draw_fits(canvas, x, by or ("subject", "condition"))
             case Posterior(), None, None:
                 return elements.draw_posterior(canvas, x)
             case Profile(), None, None:

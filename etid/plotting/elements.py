@@ -21,32 +21,54 @@ from etid.plotting.style import (
     symbol,
     titled,
 )
+from etid.recordings.fields import LABELS, check_names
 from etid.results.fits import Fits
 from etid.results.posterior import Posterior, Profile
 from etid.simulation.bound import Bound
 
 LEVEL = 0.95
+FEW = 3  # the least number of fits that have a variation
 
 
-def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
-    """Elements of all fits by subject, with standard errors; fits without success are hollow."""
+def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
+    """Elements of all fits by two labels, with standard errors; fits without success are hollow.
+
+    A thick bar is the median of a group with the variation between its fits beyond their errors.
+
+    Raises:
+        ValueError: There are no fits, or `by` is not two labels.
+        RecordingError: There is no such label.
+    """
     if not len(fits):
         raise ValueError("there are no fits to draw")
+    if isinstance(by, str) or len(by) != 2:
+        raise ValueError(f"by is {by!r}, must be two labels, such as ('session', 'subject')")
+    check_names(dict.fromkeys(by), LABELS, "label")
     units = fits.circuit.units()
     axes = canvas(len(units), 1, (7.5, 0.6 + 2.2 * len(units)), sharex=True).ravel()
-    subjects, place = np.unique(fits.labels["subject"], return_inverse=True)
-    conditions = np.unique(fits.labels["condition"]).tolist()
-    x = _side_by_side(place, fits.labels["condition"], conditions)
+    labels, second = (fits.labels[name].astype(str) for name in by)
+    groups, place = np.unique(labels, return_inverse=True)
+    series = np.unique(second).tolist()
+    x = _side_by_side(place, second, series)
+    summary = [one for one in fits.summary(*by) if one["successful"] >= FEW]
+    middle = [
+        groups.tolist().index(one[by[0]]) + _offset(series.index(one[by[1]]), len(series))
+        for one in summary
+    ]
     good = fits.verdicts == "successful"
     for axis, (name, unit) in zip(axes, units.items(), strict=True):
         scale = DISPLAY[unit][0]
         values = np.asarray(getattr(fits.circuit, name)) / scale
         errors = np.asarray(getattr(fits.stderr, name)) / scale
         known = drawable(values)
-        for i, condition in enumerate(conditions):
-            of = known & (fits.labels["condition"] == condition)
-            _points(axis, x, values, errors, of & good, i, condition, hollow=False)
-            _points(axis, x, values, errors, of & ~good, i, condition, hollow=True)
+        for i, label in enumerate(series):
+            of = known & (second == label)
+            _points(axis, x, values, errors, of & good, i, label, hollow=False)
+            _points(axis, x, values, errors, of & ~good, i, label, hollow=True)
+        medians, between = (
+            np.array([one[name + part] for one in summary]) / scale for part in ("", "_between")
+        )
+        axis.errorbar(middle, medians, between, fmt="_", ms=14, lw=5, color=INK, alpha=0.3)
         axis.set_yscale("log")
         shown = known
         if (good & known).any():  # an undetermined element may lie decades away
@@ -66,27 +88,33 @@ def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
                     textcoords="offset points", fontsize=7, color="0.35",
                 )  # fmt: skip
         axis.set_ylabel(symbol(name, unit))
-    names = [str(subject) or "-" for subject in subjects]
+    names = [one or "-" for one in groups.tolist()]
     turned = sum(map(len, names)) > 60
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
-    axes[-1].set_xlabel("subject")
-    _legend(axes[0], conditions, "" if good.all() else "without success")
+    axes[-1].set_xlabel(by[0])
+    _legend(axes[0], series, "" if good.all() else "without success")
     counted = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
-    titled(
-        axes[0], [f"{len(fits)} fits: {counted}; bars: one standard error"], good=bool(good.any())
-    )
+    lines = [f"{len(fits)} fits: {counted}; bars: one standard error"]
+    if summary:
+        lines.append("thick: medians, and the variation between fits beyond their errors")
+    titled(axes[0], lines, good=bool(good.any()))
     return axes
 
 
-def _side_by_side(place: np.ndarray, labels: np.ndarray, conditions: Sequence[str]) -> np.ndarray:
-    """Horizontal position of each fit: conditions side by side, trials spread out."""
-    width = 0.8 / len(conditions)
+def _offset(series: int, count: int) -> float:
+    """Place of a series beside its group."""
+    return (series + 0.5) * 0.8 / count - 0.4
+
+
+def _side_by_side(place: np.ndarray, labels: np.ndarray, series: Sequence[str]) -> np.ndarray:
+    """Horizontal position of each fit: series side by side, trials spread out."""
+    width = 0.8 / len(series)
     x = place.astype(float)
-    for i, condition in enumerate(conditions):
-        for subject in range(place.max() + 1):
-            rows = np.flatnonzero((labels == condition) & (place == subject))
+    for i, label in enumerate(series):
+        for group in range(place.max() + 1):
+            rows = np.flatnonzero((labels == label) & (place == group))
             fan = np.linspace(-0.35, 0.35, rows.size) if rows.size > 1 else np.zeros(rows.size)
-            x[rows] += (i + 0.5) * width - 0.4 + fan * width
+            x[rows] += _offset(i, len(series)) + fan * width
     return x
 
 

@@ -1,6 +1,5 @@
 """Where the electrodes of a display are."""
 
-import csv
 import dataclasses
 import json
 import os
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.recordings.errors import RecordingError, located, require_file
+from etid.recordings.tables import rows_of
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -96,10 +96,7 @@ def read_layout(path: str | os.PathLike[str]) -> Layout:
     with located(str(file), foreign=(ValueError, KeyError, UnicodeDecodeError)):
         if file.suffix.lower() == ".json":
             return _of_probe(json.loads(file.read_text("utf-8")))
-        with file.open(encoding="utf-8-sig", newline="") as lines:
-            rows = list(csv.DictReader(lines, skipinitialspace=True))
-        if not rows or not {"electrode", "x", "y"} <= rows[0].keys():
-            raise RecordingError("must have the columns electrode, x and y, and a row for each")
+        rows = rows_of(file, ("electrode", "x", "y"))
         x, y = ([float(row[name]) for row in rows] for name in ("x", "y"))
         return Layout([row["electrode"] for row in rows], np.array(x), np.array(y))
 

@@ -14,7 +14,7 @@ from etid.results.fits import Fits
 
 COLOURS = "cividis"  # readers with and without red-green blindness see it alike
 BY = ("subject", "session", "site", "condition")  # a map for each combination
-ROW = 4  # maps side by side
+ROW = 6  # maps side by side
 DOT = 0.9  # diameter of an electrode, relative to the distance of neighbours
 
 
@@ -33,7 +33,7 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     if not len(fits):
         raise ValueError("there are no fits to draw")
     place = layout.place(fits.labels["electrode"])
-    keys = list(zip(*(fits.labels[name].astype(str) for name in BY), strict=True))
+    keys = groups_of(fits)
     groups = sorted(set(keys))
     values = np.asarray(getattr(fits.circuit, element)) / DISPLAY[units[element]][0]
     good = (fits.verdicts == "successful") & drawable(values)
@@ -74,6 +74,11 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     return axes.ravel()
 
 
+def groups_of(fits: Fits) -> list[tuple[str, ...]]:
+    """Labels `BY` of each fit: those of one map are equal."""
+    return list(zip(*(fits.labels[name].astype(str) for name in BY), strict=True))
+
+
 def _round(values: np.ndarray) -> tuple[float, float]:
     """Limits of a scale: at least a factor of 1.2 apart."""
     middle = np.sqrt(values.min() * values.max())
@@ -98,9 +103,8 @@ def _electrodes(
     axis.plot(x, y, ".", ms=2, color="0.75", zorder=1)
     shown = np.unique(place[good])
     medians = np.array([np.median(values[good & (place == one)]) for one in shown])
-    size = np.full(shown.size, DOT * pitch)
     dots = EllipseCollection(
-        size, size, np.zeros(shown.size), units="x", cmap=COLOURS, norm=norm, array=medians,
+        [DOT * pitch], [DOT * pitch], [0.0], units="x", cmap=COLOURS, norm=norm, array=medians,
         offsets=np.column_stack([x[shown], y[shown]]), offset_transform=axis.transData,
         zorder=2,
     )  # fmt: skip

@@ -1,4 +1,6 @@
-"""Probable causes of verdicts of the pre-flight, with the numbers that show them."""
+"""Probable causes of verdicts of the pre-flight, and what it changed, with numbers."""
+
+import logging
 
 import numpy as np
 from jaxtyping import Float
@@ -6,6 +8,27 @@ from jaxtyping import Float
 from etid.circuits.display import several
 from etid.recordings.preflight import Inspected
 from etid.signals.pulse_train import lags_of, shifted, whole_lag
+
+LOG = logging.getLogger("etid")
+
+
+def log_changes(inspected: Inspected) -> None:
+    """Log how a recording was changed before its fit."""
+    if not LOG.isEnabledFor(logging.INFO):
+        return
+    lines = [how_shifted(inspected)]
+    if inspected.kept is not None:
+        whole, spacing = inspected.whole_periods[0], inspected.spacing
+        left = set(range(whole)) - {round(first / spacing) for first in inspected.kept.first}
+        numbers = ", ".join(str(number + 1) for number in sorted(left))
+        lines.append(f"left out of {several(whole, 'period')}: {numbers}." if left else "")
+    if inspected.lag:
+        lines.append(f"v_out was taken {several(inspected.lag, 'sample')} earlier.")
+    if inspected.hums:
+        found = {f"{hum.frequency:.2f} Hz" for hum in inspected.hum if hum is not None}
+        lines.append(f"hum of {' and '.join(sorted(found))} was subtracted.")
+    for line in filter(None, lines):
+        LOG.info("%s: %s", inspected.recording.path or "recording", line)
 
 
 def why_implausible(inspected: Inspected) -> str:

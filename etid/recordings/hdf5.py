@@ -197,12 +197,64 @@ def _write_attribute(owner: h5py.Group | h5py.Dataset, name: str, value: Any) ->
     owner.attrs.create(name, data[0] if isinstance(value, str) else data, dtype=dtype)
 
 
-# --- Merging --------------------------------------------------------------------------------------
+# --- Drivers of other files, and merging ----------------------------------------------------------
+
+
+def read_calibrations(path: str | os.PathLike[str]) -> Study:
+    """The recordings with known resistors of a file, all of one driver.
+
+    Raises:
+        RecordingError: The file cannot be read, or holds calibrations of no driver or of several.
+    """
+    whole = read(path)
+    found = whole.calibrations
+    sessions = {found.metadata(one).session for one in found} - {""}
+    named = {whole.metadata(one).calibration for one in whole.loaded} - {()}
+    if found and len(sessions) < 2 and len(named) < 2:
+        return found
+    whole.close()
+    if not found:
+        raise RecordingError(
+            "holds no recording with a known resistor",
+            file=os.fspath(path),
+            remedy="Import it with its resistor: etid import FILE --r-load OHM",
+        )
+    which = f"sessions {', '.join(sorted(sessions))}" if len(sessions) > 1 else "several drivers"
+    raise RecordingError(
+        f"holds calibrations of {which}",
+        file=os.fspath(path),
+        remedy="Write those of one: Study.from_recordings([study[path], …]).write(FILE)",
+    )
+
+
+def read_with_driver(path: str | os.PathLike[str], driver: str | os.PathLike[str]) -> Study:
+    """The loaded recordings of a file; the calibrations of another file are theirs.
+
+    Args:
+        path: File of recordings. Its own calibrations are left out.
+        driver: File of the calibrations of one driver. They come into a group of its name.
+
+    Raises:
+        RecordingError: As `read` and `read_calibrations`.
+    """
+    calibrations, whole = read_calibrations(driver), read(path)
+    moved = _moved(calibrations, pathlib.Path(os.fspath(driver)).name)
+    names = tuple(moved)
+    for own in whole.loaded:
+        source = whole.source(own)
+        known = dataclasses.replace(source.metadata, calibration=names)
+        moved[own] = _Moved(source.layout, source.unloaded, source, known)
+
+    def close() -> None:
+        calibrations.close()
+        whole.close()
+
+    return Study(moved, problems=whole.problems, file=whole.file, close=close)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Moved(AbstractSource):
-    """A recording of another file, below a group of this file."""
+    """A recording of another file, with another path or other calibrations."""
 
     source: AbstractSource
     moved: Metadata

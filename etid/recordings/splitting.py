@@ -1,4 +1,4 @@
-"""Parts of one long record: by pauses between its pulses, or by a trigger channel."""
+"""Parts of one long record: by pauses between its pulses, a trigger, or what says who fires."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -6,22 +6,49 @@ from jaxtyping import Float, Int
 from etid.recordings.errors import RecordingError
 from etid.signals.pulse_train import find_pulses
 
+WHOLE = 0.1  # largest distance of a value from the whole number that it means
+
 
 def split(
     cause: Float[np.ndarray, " time"],
     sample_rate: float,
     pulse_rate: float,
     trigger: Float[np.ndarray, " _"] | None = None,
+    which: Float[np.ndarray, " _"] | None = None,
+    *,
+    cut: bool = True,
 ) -> list[slice]:
     """The parts of a record, each with whole pulse periods.
 
     Without a trigger, a part is a train of pulses between pauses. With one, a part has the pulses
     from one rising edge, where the trigger rises through the middle of its range, to the next, up
     to the first pause. A pulse may precede its trigger by a tenth of a period.
+
+    With `which`, whose value says what fires, a part is a train of pulses with one value. The value
+    is that of a tenth of a period behind the start of a pulse (`firing`).
+
+    Args:
+        cause: Unloaded voltage or current.
+        sample_rate: Samples per second [Hz].
+        pulse_rate: Pulses per second [Hz].
+        trigger: Trigger.
+        which: Channel with one value for each that fires.
+        cut: Whether trains that an end of the record cuts may be left out.
+
+    Raises:
+        RecordingError: There are no pauses, no pulses behind an edge of the trigger, or an end of
+            the record cuts a train that may not be left out.
     """
     period = sample_rate / pulse_rate
     edges = find_pulses(cause, sample_rate, pulse_rate).edges
-    if trigger is not None:
+    if which is not None:
+        own = firing(which, edges, period)
+        trains = [
+            train
+            for pulses in np.split(edges, np.flatnonzero(np.diff(own) != 0) + 1)
+            for train in _trains(pulses, period)
+        ]
+    elif trigger is not None:
         trains = _after_edges(trigger, cause, edges, period)
     else:
         trains = _trains(edges, period)
@@ -35,7 +62,30 @@ def split(
     starts = [int(train[0] - round(0.2 * period)) for train in trains]
     stops = [at + round(len(train) * period) for at, train in zip(starts, trains, strict=True)]
     both = zip(starts, stops, strict=True)  # an end of the record may cut a train
-    return [slice(start, stop) for start, stop in both if start >= 0 and stop <= cause.size]
+    whole = [slice(start, stop) for start, stop in both if start >= 0 and stop <= cause.size]
+    if not cut and len(whole) < len(trains):
+        raise RecordingError(
+            "an end of the record cuts the first or the last train of pulses",
+            remedy="Record a period without pulses before the first and behind the last",
+        )
+    return whole
+
+
+def firing(
+    which: Float[np.ndarray, " time"], edges: Int[np.ndarray, " edge"], period: float
+) -> Int[np.ndarray, " edge"]:
+    """The value of each pulse in a channel that says what fires: a whole number."""
+    at = np.minimum(edges + round(period / 10), which.size - 1)
+    values = which[at]
+    wrong = np.flatnonzero(~(np.abs(values - np.round(values)) < WHOLE))
+    if wrong.size:
+        raise RecordingError(
+            f"is {values[wrong[0]]:g} at sample {at[wrong[0]]}, must be a whole number at each "
+            "pulse",
+            field="split",
+            remedy="Name the channel whose value says which electrode fires",
+        )
+    return np.round(values).astype(int)
 
 
 def _trains(edges: Int[np.ndarray, " edge"], period: float) -> list[Int[np.ndarray, " _"]]:

@@ -20,6 +20,8 @@ from matplotlib.figure import Figure
 
 from etid.circuits.display import DISPLAY
 from etid.plotting import figure_of
+from etid.plotting.layout import Layout
+from etid.plotting.maps import BY, groups_of
 from etid.plotting.style import (
     COLOURS,
     DASHES,
@@ -40,6 +42,7 @@ SVG: Any = {
 }
 NARROW = 3.0  # ratio of the largest to the smallest value; above, an axis is logarithmic
 CROWD = 120  # largest number of subjects in a figure
+MAPS = 24  # largest number of maps of a display, for each element
 SERIES = 4  # largest number of conditions in a figure
 
 
@@ -217,11 +220,25 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
 
 def each_fit(fits: Fits) -> bytes:
     """Each fit with its standard error, by subject."""
-    labels = {
-        name: np.array([_short(str(label)) for label in fits.labels[name]])
-        for name in ("subject", "condition", "electrode", "trial")
-    }
-    return svg(figure_of(dataclasses.replace(fits, labels={**fits.labels, **labels})))
+    return svg(figure_of(_shortened(fits, ("subject", "condition", "electrode", "trial"))))
+
+
+def mapped(fits: Fits) -> tuple[Fits, int]:
+    """The fits of the first `MAPS` maps of a display, and the number of all maps."""
+    of = fits.take(fits.labels["electrode"] != "")
+    keys = groups_of(of)
+    first = sorted(set(keys))
+    return of.take(np.array([key in first[:MAPS] for key in keys])), len(first)
+
+
+def electrodes(fits: Fits, element: str, layout: Layout) -> bytes:
+    """An element at each electrode of a display, on one scale for all maps."""
+    return svg(figure_of(_shortened(fits, BY), map=element, layout=layout))
+
+
+def _shortened(fits: Fits, names: Sequence[str]) -> Fits:
+    labels = {name: np.array([_short(str(one)) for one in fits.labels[name]]) for name in names}
+    return dataclasses.replace(fits, labels={**fits.labels, **labels})
 
 
 def drivers(found: Mapping[str, Driver]) -> bytes:

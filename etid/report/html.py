@@ -31,6 +31,7 @@ class Table:
         groups: Headings above the headings, each with the number of columns that it spans.
         caption: Text above the table.
         searchable: Whether the page lets the reader sort the table and search in it.
+        folded: Whether the page shows the table, below the pictures, when the reader asks for it.
         links: Anchors of the page for cells of the first column.
     """
 
@@ -39,6 +40,7 @@ class Table:
     groups: tuple[tuple[str, int], ...] = ()
     caption: str = ""
     searchable: bool = False
+    folded: bool = False
     links: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -255,7 +255,8 @@ def _table(found: StudyFits, settings: Settings) -> Table:
     """The settings of the run as a table."""
     source = "in memory"
     if settings.source:
-        source = f"file {settings.source} of {settings.source_size} bytes"
+        source = f"file {settings.source}, SHA-256 {settings.source_sha256 or 'not known'}"
+    driver = f"of {settings.driver}, " if settings.driver else ""
     circuit = type(found.fits.circuit).__name__
     if settings.candidates:
         circuit += f", chosen among {', '.join(sorted(settings.candidates))}"
@@ -264,8 +265,8 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         "recordings": source,
         "method": f"asked for {settings.asked_method or 'none'}, used {found.fits.fit.method}",
         "circuit": circuit,
-        "Z_th": f"order {settings.order or 'auto'}, drift of {100 * settings.driver_drift:g} %, "
-        f"accepted from {low:g} to {high:g} ohm at 1 kHz",
+        "Z_th": f"{driver}order {settings.order or 'auto'}, drift of "
+        f"{100 * settings.driver_drift:g} %, accepted from {low:g} to {high:g} ohm at 1 kHz",
         "R_L": f"standard deviation of {100 * settings.r_load_tolerance:g} %",
         "tolerances of the instrument": ", ".join(settings.instrument) or "none",
         "known elements": ", ".join(settings.fixed + settings.prior + settings.bounds) or "none",

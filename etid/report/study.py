@@ -3,6 +3,7 @@
 The page needs no network and can be printed. It has a few megabytes at most for any number of fits.
 """
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several
+from etid.plotting.layout import FINGERTIP, Layout
 from etid.precision import in_float64
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.study import Study
@@ -33,6 +35,7 @@ def write_report(
     *,
     recordings: str | os.PathLike[str] | Study | None = None,
     circuit: type[AbstractCircuit] | None = None,
+    layout: Layout = FINGERTIP,
 ) -> None:
     """Write a report on the fits of a study: one HTML page that needs no other file.
 
@@ -47,6 +50,8 @@ def write_report(
             `write_report` looks at the path that is stored with the fits, then in the folder of the
             file of fits. If it does not find the recordings, the report says so.
         circuit: As in `Fits.read`.
+        layout: Places of the electrodes, for maps of the elements; default: those of the paper's
+            display, `E1` to `E98`. Fits of electrodes without a place have no maps.
 
     Raises:
         ValueError: `fits` is not a file of fits or holds no fit, or `page` would replace a file
@@ -78,7 +83,7 @@ def write_report(
                 _drivers(found),
                 _elements(found.fits, groups),
                 _subjects(found.fits, groups),
-                *_electrodes(found.fits),
+                *_electrodes(found.fits, layout),
                 _quality(found.fits),
                 _recordings(found.fits, drawn),
                 drawn,
@@ -218,12 +223,33 @@ def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
     return _grouped("Subjects", text, groups, ("subject", "condition"), fits, pictures)
 
 
-def _electrodes(fits: Fits) -> list[Section]:
-    if len(set(map(str, fits.labels["electrode"]))) < 2:
+def _electrodes(fits: Fits, layout: Layout) -> list[Section]:
+    names = set(map(str, fits.labels["electrode"])) - {""}
+    if len(names) < 2:
         return []
     text = "The same by electrode. Subjects are part of what varies here."
     rows = fits.summary("electrode", "condition")
-    return [_grouped("Electrodes", text, rows, ("electrode", "condition"), fits, ())]
+    if not names <= set(layout.electrodes):
+        text += " For maps, give the places of the electrodes: etid report --layout FILE."
+        return [_grouped("Electrodes", text, rows, ("electrode", "condition"), fits, ())]
+    shown, count = figures.mapped(fits)
+    text = (
+        "Median of the successful trials of each electrode, on one scale. The table has the same "
+        "by electrode; subjects are part of what varies in it."
+    )
+    if count > figures.MAPS:
+        text += f" {figures.MAPS} of {count} maps are drawn; etid.plot(fits, map=…) draws others."
+    pictures = tuple(
+        Picture(
+            f"{name} at each electrode; an electrode without success has the mark of its verdict.",
+            figures.electrodes(shown, name, layout),
+            f"Maps of {name} by subject, session, site and condition.",
+            whole=True,
+        )
+        for name in fits.circuit.units()
+    )
+    of = _grouped("Electrodes", text, rows, ("electrode", "condition"), fits, pictures)
+    return [dataclasses.replace(of, tables=(dataclasses.replace(of.tables[0], folded=True),))]
 
 
 def _grouped(

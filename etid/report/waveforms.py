@@ -18,9 +18,9 @@ from etid.report.tables import significant
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.results.fits import Fits
-from etid.results.study_fits import StudyFits
+from etid.results.study_fits import StudyFits, sha256
 
-FAILED, STRAINED, UNCERTAIN = 6, 3, 3  # largest number of fits of each kind
+FAILED, STRAINED, UNCERTAIN = 6, 2, 2  # largest number of fits of each kind
 
 
 class Recordings:
@@ -61,10 +61,10 @@ class Recordings:
     def _open(self, path: pathlib.Path) -> None:
         self.study, self._opened = read(path), True
         settings = self._found.settings
-        if settings is not None and settings.source_size not in (0, path.stat().st_size):
+        if settings is not None and settings.source_sha256 not in ("", sha256(path)):
             self.problem = (
-                f"{path} has changed since the fits were made: it had {settings.source_size} bytes "
-                f"and has {path.stat().st_size} now. The waveforms may differ from the fits."
+                f"{path} has changed since the fits were made: its SHA-256 is no longer "
+                f"{settings.source_sha256}. The waveforms may differ from the fits."
             )
 
     def _look(self, file: pathlib.Path | None) -> None:
@@ -109,6 +109,8 @@ class Recordings:
         names = ("path", *LABELS)
         shown = recording.replace(**{name: plain(getattr(recording, name)) for name in names})
         names = recording.calibration or tuple(self.study.calibrations)
+        if self._found.settings is not None and self._found.settings.driver:
+            names = next(iter(self._found.drivers), ())  # the only driver, of another file
         by_current = recording.cause == "current"  # the fit needs no driver then
         driver = None if by_current else self._found.drivers.get(names)
         figure, why = _predicted(shown, fit, driver)
@@ -138,18 +140,14 @@ def _predicted(recording: Recording, fit: Fit, driver: Driver | None) -> tuple[F
 
 
 def waveforms(fits: Fits, place: Recordings) -> Section:
-    """Measured and predicted pulses of the worst fits, or of all if they are few."""
+    """Measured and predicted pulses of the worst fits."""
     text = (
         "First fits without success: for each verdict those with the largest χ². Then successful "
         "fits with the largest χ² and with the largest standard error. One pulse of each."
     )
     chosen = worst(fits)
-    all_drawn = len(fits) <= 24
-    if all_drawn:
-        chosen = dict.fromkeys(range(len(fits)), "") | chosen
     if len(fits) == 1:
-        text = "One pulse."
-        chosen = {0: ""}
+        text, chosen = "One pulse.", {0: ""}
     text += (
         " If the model is right, the residual is noise. At the edges of a pulse it also contains "
         "frequencies near half the sample rate, which are aliased and not fitted."
@@ -164,7 +162,7 @@ def waveforms(fits: Fits, place: Recordings) -> Section:
             pictures.append(picture)
     if missing:
         text += f"\n\nThese recordings cannot be read and have no waveform: {', '.join(missing)}."
-    heading = "Waveforms" if all_drawn else "Worst fits"
+    heading = "Worst fits" if len(fits) > 1 else "Waveform"
     return Section(heading, text, (), tuple(pictures), warning=place.problem)
 
 

@@ -16,7 +16,7 @@ from etid.circuits.lookup import class_path
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.fields import DESCRIBING, Label, wanted_labels
 from etid.results.fit import Fit
-from etid.results.fits_columns import DESCRIBED, LABELS, LIMITS, SCHEMA, columns_of
+from etid.results.fits_columns import DESCRIBED, LABELS, LIMITS, SCHEMA, columns_of, long_form
 from etid.results.hdf5_table import Table, opened_table, write_table
 from etid.results.verdicts import counted, counts
 
@@ -134,13 +134,23 @@ class Fits(Overviewed, Generic[Circuit]):
         """How often each verdict occurs, most frequent first."""
         return counts(self.verdicts)
 
-    def table(self) -> dict[str, np.ndarray]:
-        """One column per label, element [SI], standard error, quality and verdict."""
-        labels = {name: self.labels[name] for name in DESCRIBED}
-        return labels | self.fit.table() | {"note": self.notes}
+    def table(self, *, long: bool = False) -> dict[str, np.ndarray]:
+        """One column per label, element [SI], standard error, quality and verdict.
 
-    def to_pandas(self) -> Any:
+        Args:
+            long: One row per element in place of one per fit, as mixed models and plots of groups
+                take it: the columns `element`, `unit`, `value` and `stderr` in place of those of
+                the elements and their changes.
+        """
+        labels = {name: self.labels[name] for name in DESCRIBED}
+        whole = labels | self.fit.table() | {"note": self.notes}
+        return long_form(whole, self.circuit.units()) if long else whole
+
+    def to_pandas(self, *, long: bool = False) -> Any:
         """The table as a pandas DataFrame.
+
+        Args:
+            long: As in `table`.
 
         Raises:
             ImportError: pandas is not installed.
@@ -150,7 +160,7 @@ class Fits(Overviewed, Generic[Circuit]):
         except ImportError as error:
             install = "pip install 'etid[table]' (in a clone: '.[table]')"
             raise ImportError(f"to_pandas needs pandas: {install}") from error
-        return pandas.DataFrame(self.table())
+        return pandas.DataFrame(self.table(long=long))
 
     def summary(self, *by: str) -> list[dict[str, Any]]:
         """Counts, and medians of the successful fits, for each group of labels.

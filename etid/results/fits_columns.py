@@ -41,6 +41,24 @@ def described(recordings: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
     }
 
 
+def long_form(columns: Mapping[str, np.ndarray], units: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """A table of fits with one row per element: `element`, `unit`, `value` and `stderr`.
+
+    Args:
+        columns: The columns of `Fits.table()`. Those that are not of an element stay.
+        units: Units of the elements.
+    """
+    own = {name + end for name in (*units, "amplitude") for end in ("", "_stderr", "_change")}
+    count = len(columns["path"])
+    return {
+        **{name: np.repeat(of, len(units)) for name, of in columns.items() if name not in own},
+        "element": np.tile(list(units), count),
+        "unit": np.tile(list(units.values()), count),
+        "value": np.stack([columns[name] for name in units], axis=1).ravel(),
+        "stderr": np.stack([columns[f"{name}_stderr"] for name in units], axis=1).ravel(),
+    }
+
+
 def columns_of(
     table: Table, circuit: type[AbstractCircuit] | None
 ) -> tuple[type[AbstractCircuit], dict[str, Any], dict[str, np.ndarray], np.ndarray]:

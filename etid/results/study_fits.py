@@ -6,6 +6,7 @@ dataset `drivers` with one line of JSON for each driver. `etid.Fits.read` ignore
 
 import dataclasses
 import functools
+import hashlib
 import importlib.metadata
 import itertools
 import json
@@ -49,7 +50,7 @@ class Settings:
 
     Attributes:
         source: Absolute path of the file of recordings; empty if they were in memory.
-        source_size: Size of the file [byte], which detects another file of the same name; 0 if
+        source_sha256: Checksum of the file, which detects another file of the same name; empty if
             the recordings were in memory.
         recordings: Number of recordings to identify.
         asked_method: The method that the user chose; empty if etid chose it for each recording.
@@ -71,10 +72,11 @@ class Settings:
         plausible: As in `identify_driver`. Files of earlier versions do not store it.
         instrument: Tolerances of the instrument that are not 0 [SI], such as `"gain 0.001"`. Files
             of earlier versions do not store them.
+        driver: Absolute path of the file of the driver; empty if the recordings name their own
+            calibrations.
     """
 
     source: str
-    source_size: int
     recordings: int
     asked_method: str
     order: int
@@ -90,6 +92,14 @@ class Settings:
     versions: tuple[str, ...]
     plausible: tuple[float, ...] = PLAUSIBLE
     instrument: tuple[str, ...] = ()
+    source_sha256: str = ""
+    driver: str = ""
+
+
+def sha256(path: str | os.PathLike[str]) -> str:
+    """Checksum of a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @functools.cache

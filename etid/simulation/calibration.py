@@ -18,9 +18,9 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.identify.driver import identify_driver
 from etid.identify.skins import identify_skin
 from etid.precision import in_float64
-from etid.recordings.hdf5 import read
+from etid.recordings.hdf5 import read_calibrations
 from etid.recordings.preflight import Inspected
-from etid.recordings.recording import Recording, RecordingError
+from etid.recordings.recording import Recording
 from etid.recordings.study import Study
 from etid.results.driver import AUTO, Driver, Order
 from etid.results.fit import Fit, IdentificationError
@@ -150,7 +150,7 @@ def read_driver(path: str | os.PathLike[str], *, order: Order = AUTO) -> Driver:
         order: Number of poles of Z_th, or `"auto"`.
 
     Raises:
-        RecordingError: The file cannot be read, or has no calibrations.
+        RecordingError: The file cannot be read, or has calibrations of no driver or of several.
         IdentificationError: The calibrations give no driver.
     """
     return identify_driver(calibrations_in([path]), order=order)
@@ -160,18 +160,12 @@ def calibrations_in(paths: Sequence[str | os.PathLike[str]]) -> list[Recording]:
     """The recordings with known resistors of some files.
 
     Raises:
-        RecordingError: A file cannot be read, or none has such a recording.
+        RecordingError: A file cannot be read, or has such recordings of no driver or of several.
     """
     records: list[Recording] = []
     for path in paths:
-        with read(path) as study:
-            records += study.calibrations.recordings()
-    if not records:
-        raise RecordingError(
-            "holds no recording with a known resistor",
-            file=os.fspath(paths[0]),
-            remedy="Import it with its resistor: etid import FILE --r-load OHM",
-        )
+        with read_calibrations(path) as study:
+            records += study.recordings()
     return records
 
 

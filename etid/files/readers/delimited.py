@@ -305,12 +305,21 @@ def _header(text: TextIO, dialect: Dialect) -> tuple[tuple[str, ...], tuple[str,
 def _preamble(path: pathlib.Path, dialect: Dialect) -> tuple[float, float | None]:
     """Number of samples and sample rate [Hz] in a preamble; 0 and None if it names none.
 
-    The name is in the first cell of a line, the value in the second.
+    The name is in the first cell of a line, the value in the second. Rigol writes the interval
+    below the name `Increment`, or as `tInc = 1e-6`.
     """
-    length, rate = 0.0, None
+    length, rate, above = 0.0, None, []
     with path.open(newline="", encoding=dialect.encoding) as text:
         for line in itertools.islice(text, LINES):
-            cell, value, unit, *_ = (*dialect.cells(line), "", "", "")
+            cells = dialect.cells(line)
+            for name, value in [
+                *zip(above, cells, strict=False),
+                *(cell.split("=") for cell in cells if cell.count("=") == 1),
+            ]:
+                if name.strip().lower() in ("increment", "tinc") and dialect.is_number(value):
+                    rate = rate_of(float(value.replace(dialect.decimal, ".")), 1e-6)
+            cell, value, unit, *_ = (*cells, "", "", "")
+            above = cells
             if not dialect.is_number(value):
                 continue
             number, name = float(value.replace(dialect.decimal, ".")), cell.strip(":").lower()

@@ -1,0 +1,145 @@
+"""The live view: what the loop of a display spends on its page, and whether memory grows.
+
+Pulses of 98 electrodes come at 60 Hz for ten minutes, and windows read the page ten times a second.
+A tick is late because of the page if it fits into a pulse period, but not together with what is
+handed over. Wall time contains what other programs of the machine take, the processor's time of
+this process does not. The table is `live.csv`. A missed target makes the command end with 1.
+"""
+
+import argparse
+import os
+import pathlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+import etid
+from benchmarks.machine import RESULTS, write_csv
+from benchmarks.online import CHARGE, problem
+from benchmarks.runner import Target, at_most, option, report
+from etid.live.loop import Tick, follow
+from etid.live.view import LiveView
+from etid.online.stream import Block
+
+TARGETS = {
+    "ticks that are late because of the page, by the processor's time": at_most(0),
+    "p99 of the hand-over / pulse period, by the processor's time": at_most(0.2),
+    "growth of the loop's memory [MB]": at_most(20),
+    "growth of the page's memory [MB]": at_most(5),
+}
+SETTLED = 0.2  # of the time, after which memory should not grow
+READER = """
+import sys, time, urllib.request
+while True:
+    urllib.request.urlopen(sys.argv[1] + "/state").read()
+    time.sleep(0.1)
+"""
+
+OPTIONS = (
+    option("--electrodes", default=98),
+    option("--minutes", default=10.0),
+    option("--windows", default=2, help="readers of the page"),
+    option("--port", default=0, help="of the page, to open it in a browser; 0: any"),
+    option("-o", "--output", type=pathlib.Path, default=RESULTS / "live.csv"),
+)
+
+
+class Timed(LiveView):
+    """A view that notes of each tick whether it was shown, and what this took.
+
+    Attributes:
+        taken: By tick: whether a snapshot was due; time by the clock and of the processor for it,
+            and time of the processor for the tick [s].
+    """
+
+    taken: list[tuple[bool, float, float, float]]
+    last = 0.0
+
+    def show(self, tick: Tick) -> None:
+        """Hand over a tick."""
+        due, wall, busy = self._due, time.perf_counter(), time.process_time()
+        super().show(tick)
+        now = time.process_time()
+        taken = (self._due != due, time.perf_counter() - wall, now - busy, busy - self.last)
+        self.taken.append(taken)
+        self.last = now
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Print the table and write it; whether all targets are met."""
+    tracker, pulses = problem(arguments.electrodes, 0)
+    controller = etid.Controller.of(tracker)
+    period = tracker.period / tracker.model.bands.sample_rate
+    number = round(60 * arguments.minutes / period)
+    ticks, memory = [], []
+    view = Timed(controller, charge=CHARGE, controls=False, port=arguments.port)
+    view.taken = []
+    with view:
+        print(view.address, flush=True)
+        reader = [sys.executable, "-c", READER, view.address]
+        readers = [subprocess.Popen(reader) for _ in range(arguments.windows)]
+        try:
+            for tick in follow(
+                paced(tracker, pulses, number), controller, charge=CHARGE, view=view
+            ):
+                ticks.append(tick.seconds)
+                if tick.number in (int(SETTLED * number), number - 1):
+                    memory.append((resident(os.getpid()), resident(view._process.pid)))
+        finally:
+            for reader in readers:
+                reader.kill()
+                reader.wait()
+    seconds, (shown, wall, busy, working) = np.array(ticks), np.array(view.taken).T
+    shown = shown > 0
+    grown = np.diff(np.array(memory) / 1e6, axis=0)[0]
+
+    def late(tick: np.ndarray, handed: np.ndarray) -> int:
+        return int(
+            ((tick < period) & (tick + handed >= period))[1:].sum()
+        )  # the first one compiles
+
+    numbers = {
+        "ticks": len(ticks),
+        "snapshots": int(shown.sum()),
+        "median of the tick / pulse period": np.median(seconds) / period,
+        "median of the tick / pulse period, by the processor's time": np.median(working) / period,
+        "median of a hand-over [ms]": 1e3 * np.median(wall[shown]),
+        "median of a hand-over [ms], by the processor's time": 1e3 * np.median(busy[shown]),
+        "p99 of the hand-over / pulse period": np.percentile(wall, 99) / period,
+        "p99 of the hand-over / pulse period, by the processor's time": (
+            np.percentile(busy, 99) / period
+        ),
+        "ticks that are late by themselves": int((seconds >= period).sum()),
+        "ticks that are late because of the page": late(seconds, wall),
+        "ticks that are late because of the page, by the processor's time": late(working, busy),
+        "growth of the loop's memory [MB]": grown[0],
+        "growth of the page's memory [MB]": grown[1],
+    }
+    found = [
+        Target(name, float(value), *TARGETS.get(name, (np.nan, np.nan)))
+        for name, value in numbers.items()
+    ]
+    rows = [
+        {"quantity": of.name, "value": of.value, "least": of.least, "most": of.most} for of in found
+    ]
+    write_csv(arguments.output, rows)
+    return report(found)
+
+
+def paced(tracker: etid.Tracker, pulses: np.ndarray, number: int) -> Iterator[Block]:
+    """Blocks of one pulse each, when a converter would have them."""
+    begin = time.monotonic()
+    for at in range(number):
+        first = round(at * tracker.period)
+        due = begin + (first + pulses.shape[-1]) / tracker.model.bands.sample_rate
+        time.sleep(max(0.0, due - time.monotonic()))
+        yield first, pulses[at % len(pulses)]
+
+
+def resident(process: int | None) -> int:
+    """Memory of a process [bytes]."""
+    pages = pathlib.Path(f"/proc/{process}/statm").read_text().split()[1]
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")

@@ -1,0 +1,1 @@
+"""The live view: a page on this computer that shows a running display, and can stop it."""

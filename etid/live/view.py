@@ -1,0 +1,248 @@
+"""The live view, as the loop sees it: it is given each tick, and says whether someone has stopped.
+
+The page is served by a process of its own, which gets a snapshot ten times a second through a slot
+of fixed size. A newer snapshot replaces an older one, and nothing here waits for a page. If that
+process ends, nobody could stop any more: this counts as a stop.
+"""
+
+import importlib.util
+import multiprocessing
+import secrets
+import socket
+import time
+from collections import deque
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from etid.circuits.display import DISPLAY, heading
+from etid.estimators.unknowns import LoadUnknowns
+from etid.online.controller import Controller
+from etid.online.pulse_fit import GainModel
+from etid.plotting.layout import Layout
+from etid.precision import in_float64
+from etid.results.verdicts import verdict_names
+
+if TYPE_CHECKING:
+    from etid.live.loop import Tick
+
+PORT = 8765
+EVERY = 0.1  # [s] between two snapshots
+LAST = 0.5  # [s] that the windows have to see the last one
+COLUMNS = 7  # electrodes in a row of the paper's display
+ALARMS = 12  # alarms that are listed
+NAMED = 6  # electrodes that an alarm names
+GOOD, UNKNOWN = "good", "not identified: too_short"
+CAPS = ("peak", "charge", "guard", "voltage")  # reasons of a command that are a cap
+HIGH = 0.2  # of the largest voltage, which is exceeded where the pulse is drawn
+NANO = 1e-9
+
+
+class LiveView:
+    """A page that shows a display.
+
+    Attributes:
+        address: Where a browser of this computer finds it.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        *,
+        charge: float,
+        controls: bool,
+        layout: Layout | None = None,
+        port: int = PORT,
+    ) -> None:
+        """Begin to serve the page.
+
+        Args:
+            controller: The controller of the display.
+            charge: Wanted charge per phase [C].
+            controls: Whether the commands reach a stimulator.
+            layout: Places of the electrodes, in their order; default: E1, E2, … in rows of seven,
+                2 mm apart, as the paper's display.
+            port: Port at the loopback address; 0 for any that is free.
+
+        Raises:
+            ValueError: Tornado is missing, the layout has another number of electrodes, or the port
+                is in use.
+        """
+        if importlib.util.find_spec("tornado") is None:
+            raise ValueError(
+                "the live view needs tornado: pip install 'etid[live]', in a clone '.[live]'"
+            )
+        from etid.live.server import Slot, serve  # here, because it imports tornado
+
+        tracker = controller.tracker
+        number, bands, circuit = tracker.electrodes, tracker.model.bands, tracker.model.circuit
+        layout = layout or _rows(number)
+        if len(layout.electrodes) != number:
+            raise ValueError(
+                f"the layout has {len(layout.electrodes)} electrodes, the display {number}; give "
+                "the layout of this display"
+            )
+        self._controller, self._controls, self._names = controller, controls, layout.electrodes
+        high = np.flatnonzero(np.abs(of := bands.waveform()) > HIGH * np.abs(of).max())
+        margin = (high[-1] - high[0]) // 2 + 1
+        self._part = slice(max(high[0] - margin, 0), high[-1] + margin)
+        units = {name: circuit.units()[name] for name in circuit.names()}
+        self._scale = np.array([DISPLAY[unit][0] for unit in units.values()])
+        samples = np.arange(of.size)[self._part]
+        dtype = [
+            ("pulse", int), ("missing", int), ("late", int), ("slowest", float), ("stopped", bool),
+            ("elements", float, (len(units), number)), ("charge", float, number),
+            ("words", "S40", number), ("electrode", int), ("v_out", float, samples.size),
+            ("predicted", float, samples.size), ("alarms", "S200", ALARMS),
+        ]  # fmt: skip
+        told = {
+            "token": secrets.token_urlsafe(),
+            "start": secrets.token_urlsafe(),
+            "controls": controls,
+            "wanted": charge / NANO,
+            "names": self._names,
+            "x": layout.x.tolist(),
+            "y": layout.y.tolist(),
+            "elements": [heading(*of) for of in units.items()],
+            "time": (1e6 * samples / bands.sample_rate).tolist(),
+        }
+        try:
+            listening = socket.create_server(("127.0.0.1", port))
+        except OSError as error:
+            raise ValueError(
+                f"port {port} cannot be used ({error.strerror}); does another live view run? End "
+                "it, or name another port"
+            ) from None
+        self.address = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        context = multiprocessing.get_context("spawn")
+        self._snapshot = np.zeros(1, dtype)
+        self._slot = Slot(context, self._snapshot.dtype)
+        self._process = context.Process(
+            target=serve, args=(listening, self._slot, told), daemon=True
+        )
+        with listening:  # the other process has it
+            self._process.start()
+        self._due = self._slowest = 0.0
+        self._words = [UNKNOWN] * number
+        self._alarms: deque[str] = deque(maxlen=ALARMS)
+        self._compile()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether someone has stopped, or nobody can any more."""
+        return bool(self._slot.stop.value) or not self._process.is_alive()
+
+    def show(self, tick: "Tick") -> None:
+        """Hand over a tick, at most ten times a second, and the last one."""
+        pulse = f"Pulse {tick.number + 1}: "
+        for change in tick.changes:
+            if change.electrode is None:
+                text = "the driver has changed; calibrate again"
+            else:
+                text = (
+                    f"{change.kind} of {change.element}, to {change.factor:.2g} times its value, "
+                    f"at {self._names[change.electrode]}"
+                )
+            self._alarms.appendleft(pulse + text)
+        self._slowest = max(self._slowest, tick.seconds)
+        if time.monotonic() < self._due and not tick.stopped:
+            return
+        self._due = time.monotonic() + EVERY
+        self._alarm(pulse, self._seen(tick))
+        state = tick.state.electrodes
+        at = min(self._slot.electrode.value, len(self._names) - 1)
+        of = self._snapshot[0]
+        of["pulse"], of["missing"], of["late"] = tick.number + 1, tick.missing, tick.late
+        of["slowest"], of["stopped"], of["electrode"] = 1e3 * self._slowest, tick.stopped, at
+        own = np.asarray(state.own)
+        known = np.asarray(state.pulses) > 0
+        of["elements"] = np.where(known, np.exp(own[:, :-1].T) / self._scale[:, None], np.nan)
+        of["charge"] = self._given(tick) / NANO
+        of["words"] = [word.encode() for word in self._words]
+        of["v_out"] = tick.window[at, self._part]
+        of["predicted"] = self._predicted(tick, at)
+        texts = [text.encode() for text in self._alarms]
+        of["alarms"] = texts + [b""] * (ALARMS - len(texts))
+        self._slot.put(self._snapshot, wait=tick.stopped)
+
+    def close(self) -> None:
+        """End the page, after its windows had the time to see the last snapshot."""
+        time.sleep(LAST if self._process.is_alive() else 0)
+        self._process.terminate()
+        self._process.join()
+
+    def __enter__(self) -> "LiveView":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _compile(self) -> None:
+        """Compile what `show` uses, before a pulse waits."""
+        state = self._controller.tracker.start()
+        self._gain(np.asarray(state.electrodes.own)[0])
+        self._controller.tracker.bad_electrodes(state)
+
+    def _seen(self, tick: "Tick") -> list[str]:
+        """The state of each electrode in words."""
+        tracker, state = self._controller.tracker, tick.state
+        words = [
+            GOOD if verdict == "successful" else f"not identified: {verdict}"
+            for verdict in verdict_names(state.electrodes.result)
+        ]
+        if self._controls:
+            for at in np.flatnonzero(np.isin(tick.command.reason, CAPS)):
+                words[at] = f"cap reached: {tick.command.reason[at]}"
+        for at, reason in tracker.bad_electrodes(state).items():
+            words[at] = "contact lost" if reason == "open" else reason
+        return ["driver changed"] * len(words) if bool(state.driver_changed) else words
+
+    def _alarm(self, pulse: str, words: list[str]) -> None:
+        """Note the electrodes whose state has become another one that is not good."""
+        for word in dict.fromkeys(words):
+            new = [at for at, now in enumerate(words) if now == word != self._words[at]]
+            if new and word != GOOD:
+                more = f" and {len(new) - NAMED} more" if len(new) > NAMED else ""
+                names = ", ".join(self._names[at] for at in new[:NAMED])
+                self._alarms.appendleft(f"{pulse}{word}, at {names}{more}")
+        self._words = words
+
+    def _given(self, tick: "Tick") -> Float[np.ndarray, " lane"]:
+        """Charge per phase that the last pulse gave, with the elements after it [C]."""
+        amplitude, command = np.asarray(tick.state.electrodes.amplitude), tick.command
+        none = command.amplitude == 0  # after a stop
+        per_unit = command.charge / np.where(none, np.nan, command.amplitude)
+        return np.where(amplitude == 0, 0.0, per_unit * amplitude)
+
+    def _predicted(self, tick: "Tick", at: int) -> Float[np.ndarray, " sample"]:
+        """The pulse that the state before it predicts, with this pulse's delay and offset [V]."""
+        before, state = tick.before.electrodes, tick.state.electrodes
+        if not np.asarray(before.pulses)[at]:
+            return np.full(self._snapshot["predicted"].shape[-1], np.nan)
+        bands = self._controller.tracker.model.bands
+        x, own = np.asarray(bands.x), np.asarray(state.own)[at]
+        gain = self._gain(np.asarray(before.own)[at])
+        turn = np.arange(1, x.size + 1) / bands.samples  # per sample
+        centres = np.asarray(bands.frequency) / bands.sample_rate
+        by_bin = np.interp(turn, centres, gain)
+        spectrum = np.zeros(bands.samples // 2 + 1, complex)
+        spectrum[1 : x.size + 1] = x * by_bin * np.exp(-2j * np.pi * turn * own[-1])
+        pulse = np.fft.irfft(np.asarray(state.amplitude)[at] * spectrum, bands.samples)
+        return pulse[self._part] + tick.window[at].mean()
+
+    @in_float64
+    def _gain(self, own: Float[np.ndarray, " own"]) -> Complex[np.ndarray, " band"]:
+        return np.asarray(_undelayed(self._controller.tracker.model, own))
+
+
+@jax.jit
+def _undelayed(model: GainModel, own: Float[Array, " own"]) -> Complex[Array, " band"]:
+    return model.undelayed(LoadUnknowns.of(own).log_elements)
+
+
+def _rows(electrodes: int) -> Layout:
+    """Electrodes in rows as those of the paper's display."""
+    whole = Layout.grid(-(-electrodes // COLUMNS), COLUMNS, 2e-3)
+    return Layout(whole.electrodes[:electrodes], whole.x[:electrodes], whole.y[:electrodes])

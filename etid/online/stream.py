@@ -1,0 +1,159 @@
+"""A stream of blocks, and the windows of one pulse that a tracker needs.
+
+A block is the number of its first sample since the start, and the voltages (electrode, sample) [V].
+Blocks that are missing or late cost the pulses that they belong to, which are counted.
+"""
+
+import dataclasses
+import os
+import socket
+import time
+from collections.abc import Callable, Iterable, Iterator
+
+import h5py
+import numpy as np
+from jaxtyping import Float
+
+BLOCK = 500  # samples of a block that is played back
+GAP = 60  # lost pulses in a row that are given to the tracker one by one
+LARGEST = 10**8  # voltages in a block; a header that says more is out of step
+Block = tuple[int, np.ndarray]
+
+
+def played(
+    path: str | os.PathLike[str], electrodes: int, sample_rate: float, speed: float
+) -> Iterator[Block]:
+    """Blocks of a file, each at the time at which a converter would have delivered it.
+
+    Args:
+        path: HDF5 file with the dataset `v_out` (electrode, sample) [V].
+        electrodes: Number of electrodes.
+        sample_rate: Samples per second [Hz].
+        speed: 1 for real time.
+
+    Raises:
+        ValueError: The speed is not positive, or the file does not hold such a dataset.
+    """
+    if not speed > 0:
+        raise ValueError(f"speed is {speed}; it must be positive")
+    with h5py.File(path, "r") as file:
+        v_out = file.get("v_out")
+        if not isinstance(v_out, h5py.Dataset):
+            raise ValueError(f"{path} has no dataset v_out; store the voltages there")
+        if v_out.ndim != 2 or v_out.shape[0] != electrodes or v_out.dtype.kind != "f":
+            raise ValueError(
+                f"{path}, v_out: is {v_out.dtype} of shape {v_out.shape}; store volts as floats "
+                f"(electrode, sample), of {electrodes} electrodes as the display has"
+            )
+        begin = time.monotonic()
+        for first in range(0, v_out.shape[1], BLOCK):
+            block = v_out[:, first : first + BLOCK]
+            due = begin + (first + block.shape[1]) / sample_rate / speed
+            time.sleep(max(0.0, due - time.monotonic()))
+            yield first, block
+
+
+def connected(address: str) -> socket.socket:
+    """A connection to a server of blocks.
+
+    Raises:
+        ValueError: The address is not `host:port`.
+        OSError: Nothing listens there.
+    """
+    host, _, port = address.rpartition(":")
+    if not (host and port.isdigit()):
+        raise ValueError(f"the address is {address!r}; write host:port")
+    line = socket.create_connection((host, int(port)))
+    line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # amplitudes leave at once
+    return line
+
+
+def received(line: socket.socket) -> Iterator[Block]:
+    """Blocks from a server, until it closes the connection.
+
+    A block is a header of three little-endian 64-bit integers (first sample, electrodes, samples),
+    then the voltages as float64, electrode by electrode.
+
+    Raises:
+        ValueError: A header is out of step.
+    """
+    with line.makefile("rb") as stream:
+        while header := stream.read(24):
+            if len(header) < 24:
+                return
+            first, electrodes, samples = (int(one) for one in np.frombuffer(header, "<i8"))
+            if not (0 < electrodes <= LARGEST and 0 < samples <= LARGEST // electrodes):
+                raise ValueError(
+                    f"a block has {electrodes} electrodes and {samples} samples; is its header "
+                    "three little-endian integers of 64 bits?"
+                )
+            body = stream.read(8 * electrodes * samples)
+            if len(body) < 8 * electrodes * samples:
+                return
+            yield first, np.frombuffer(body, "<f8").reshape(electrodes, samples)
+
+
+def sender(line: socket.socket) -> Callable[[Float[np.ndarray, " lane"]], None]:
+    """What sends amplitudes to the server of the blocks: a little-endian float64 by electrode."""
+    return lambda amplitude: line.sendall(amplitude.astype("<f8").tobytes())
+
+
+@dataclasses.dataclass
+class Pulses:
+    """Cuts windows of one pulse from blocks.
+
+    Attributes:
+        period: Length of a period [samples].
+        samples: Length of a window [samples].
+        electrodes: Number of electrodes.
+        number: Number of the pulse that is being filled.
+        late: Blocks that came after their pulse was over.
+        missing: Pulses without all of their samples.
+    """
+
+    period: float
+    samples: int
+    electrodes: int
+    number: int = 0
+    late: int = 0
+    missing: int = 0
+
+    def __post_init__(self) -> None:
+        self.window = np.full((self.electrodes, self.samples), np.nan)
+
+    def begin(self, number: int) -> int:
+        """First sample of a pulse: the nearest to the start of its period."""
+        return round(number * self.period)
+
+    def cut(
+        self, blocks: Iterable[Block]
+    ) -> Iterator[tuple[int, Float[np.ndarray, "lane sample"]]]:
+        """The number of each pulse and its window [V]; what is missing is NaN.
+
+        Raises:
+            ValueError: A block has another number of electrodes.
+        """
+        for first, block in blocks:
+            if block.shape[0] != self.electrodes:
+                raise ValueError(f"a block has {block.shape[0]} electrodes, not {self.electrodes}")
+            if first + block.shape[1] <= self.begin(self.number):
+                self.late += 1
+                continue
+            lost = int(first / self.period) - self.number - 1
+            if lost > GAP:  # a long pause
+                self.missing += lost
+                self.number += lost
+                self.window = np.full_like(self.window, np.nan)
+            while True:
+                begin = self.begin(self.number)
+                low, high = max(first, begin), min(first + block.shape[1], begin + self.samples)
+                if low < high:
+                    self.window[:, low - begin : high - begin] = block[
+                        :, low - first : high - first
+                    ]
+                if first + block.shape[1] < begin + self.samples:
+                    break
+                self.missing += bool(np.isnan(self.window).any())
+                yield self.number, self.window
+                self.number += 1
+                self.window = np.full_like(self.window, np.nan)

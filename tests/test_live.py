@@ -1,0 +1,400 @@
+"""The live view: what a browser shows of a running display, its stop, and what is refused."""
+
+import contextlib
+import http.client
+import json
+import os
+import pathlib
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from chromium import chromium
+
+import etid
+from etid.live import view as views
+from etid.live.loop import Tick, follow
+from etid.live.server import HEADER
+from etid.live.view import LiveView
+from etid.online.controller import Command
+from etid.online.state import Change
+from etid.online.stream import connected, received, sender
+from etid.plotting.layout import Layout
+from etid.simulation.transformer import ResistorLoad, Sampler, loading
+from tests.test_online import LOADS, NOISE, PERIOD, PULSES, RATE, TEN, scene, tracker_of
+
+DISPLAY = 98
+WANTED = 80e-9
+SKINS = {**LOADS, "open": ResistorLoad(1e9), "short": ResistorLoad(1.0)}
+
+
+def alone():
+    """A pulse alone behind each load, and the period after it: (load, 2, sample) [V]."""
+    of = scene(1)
+    sampler = Sampler(RATE, PULSES / 2, of.antialias * RATE)
+    v_th, z_th = of.driver.v_th_spectrum(sampler.f) * PULSES / 2, of.driver.z_th(sampler.f)
+    return {
+        name: np.stack(
+            [
+                sampler.sample(v_th * loading(load(sampler.f), z_th), 3333, start)
+                for start in (0.0, 1 / PULSES)
+            ]
+        )
+        for name, load in SKINS.items()
+    }
+
+
+class Stimulator:
+    """A display at a socket: gives a pulse of each amplitude that it is sent, and records it.
+
+    Attributes:
+        skin: Name of the load at each electrode, which a test may change.
+        given: Amplitudes of all pulses.
+    """
+
+    def __init__(self, electrodes, pause=0.0):
+        self.skin, self.given, self.pause = ["dry"] * electrodes, [], pause
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.address = f"127.0.0.1:{self.server.getsockname()[1]}"
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
+
+    def _run(self):
+        pulses, noise = alone(), np.random.default_rng(0)
+        with self.server, self.server.accept()[0] as line, line.makefile("rb") as stream:
+            before = np.zeros(len(self.skin))
+            with contextlib.suppress(ConnectionError):
+                while len(told := stream.read(8 * len(self.skin))) == 8 * len(self.skin):
+                    now = np.frombuffer(told, "<f8")
+                    self.given.append(now)
+                    of = np.stack([pulses[name] for name in self.skin])
+                    v = now[:, None] * of[:, 0] + before[:, None] * of[:, 1]
+                    v += NOISE * noise.standard_normal(v.shape)
+                    begin = round((len(self.given) - 1) * PERIOD)
+                    line.sendall(np.array([begin, *v.shape], "<i8").tobytes() + v.tobytes())
+                    before = now
+                    time.sleep(self.pause)
+
+
+def controller_of(electrodes, **limits):
+    return etid.Controller.of(tracker_of(electrodes, 3e-3), **limits)
+
+
+def tick_of(tracker, number=0, changes=(), *, stopped=False, reason="wanted"):
+    """A tick of a display that was shown nothing yet."""
+    lanes, state = tracker.electrodes, tracker.start()
+    ones = np.ones(lanes)
+    command = Command(ones, ones, ones, ones, ones, np.full(lanes, reason))
+    window = np.zeros((lanes, tracker.model.bands.samples))
+    return Tick(number, window, state, state, command, list(changes), stopped, 1e-3, 0, 0)
+
+
+@pytest.fixture(scope="module")
+def view():
+    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as view:
+        yield view
+
+
+def port_of(view):
+    return int(view.address.rpartition(":")[2])
+
+
+def asked(view, method, path, body="", **headers):
+    """Status and content of an answer."""
+    line = http.client.HTTPConnection("127.0.0.1", port_of(view), timeout=20)
+    with contextlib.closing(line):
+        line.request(method, path, body, headers)
+        answer = line.getresponse()
+        return answer.status, answer.read().decode()
+
+
+def token_of(view):
+    return json.loads(re.findall(r"told = (.*);\n", asked(view, "GET", "/")[1])[0])["token"]
+
+
+def shown(view):
+    return json.loads(asked(view, "GET", "/state")[1])
+
+
+OTHER = "http://another.site"
+HOME = "http://127.0.0.1:{port}"
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "headers", "status"),
+    [
+        ("POST", "/stop", "", {}, 403),
+        ("POST", "/stop", "", {HEADER: "guessed"}, 403),
+        ("POST", "/stop", "", {HEADER: "gu\xe9ssed"}, 403),
+        ("POST", "/stop", "", {HEADER: "", "Origin": HOME}, 403),
+        ("POST", "/stop", "", {HEADER: "{token}", "Origin": OTHER}, 403),
+        ("POST", "/stop", "", {HEADER: "{token}", "Origin": "null"}, 403),
+        ("POST", "/stop", "", {HEADER: "{token}", "Host": "another.site"}, 403),
+        ("POST", "/stop?token={token}", "", {}, 403),
+        ("GET", "/stop", "", {HEADER: "{token}"}, 405),
+        ("OPTIONS", "/stop", "", {"Origin": OTHER}, 403),
+        ("POST", "/electrode", "1", {}, 403),
+        ("POST", "/electrode", "10", {HEADER: "{token}"}, 400),
+        ("POST", "/electrode", "-1", {HEADER: "{token}"}, 400),
+        ("POST", "/electrode", "E1", {HEADER: "{token}"}, 400),
+        ("POST", "/electrode", "1" * 200, {HEADER: "{token}"}, 400),
+        ("GET", "/", "", {"Host": "another.site"}, 403),
+        ("GET", "/", "", {"Host": "another.site:{port}"}, 403),
+        ("GET", "/state", "", {"Host": "another.site"}, 403),
+        ("GET", "/state", "", {"Origin": OTHER}, 403),
+        ("GET", "/../server.py", "", {}, 404),
+    ],
+)
+def test_a_request_that_is_not_the_page_s_is_refused(view, method, path, body, headers, status):
+    given = {"token": token_of(view), "port": port_of(view)}
+    headers = {name: value.format(**given) for name, value in headers.items()}
+    assert asked(view, method, path.format(**given), body, **headers)[0] == status
+    assert not view.stopped
+    assert shown(view)["electrode"] == 0
+
+
+def test_the_page_has_a_token_of_its_own_start_and_no_site_may_frame_it(view):
+    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as other:
+        assert token_of(view) != token_of(other)
+        headers = {HEADER: token_of(other), "Origin": other.address}
+        assert asked(other, "POST", "/electrode", "3", **headers)[0] == 200
+        other.show(tick_of(tracker_of(TEN, 3e-3)))
+        assert shown(other)["electrode"] == 3
+        assert asked(other, "POST", "/stop", **headers)[0] == 200
+        assert other.stopped
+        assert shown(other)["stop"]
+    assert not view.stopped
+    line = http.client.HTTPConnection("127.0.0.1", port_of(view), timeout=20)
+    line.request("GET", "/")
+    answer = line.getresponse()
+    assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+    assert answer.headers["Access-Control-Allow-Origin"] is None
+    assert not re.search(r"(src|href)=\"?http|@import|url\(", answer.read().decode())
+    line.close()
+
+
+def test_only_the_loopback_address_is_listened_at(view):
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", port_of(view)), timeout=5)
+
+
+def test_alarms_are_words():
+    tracker = tracker_of(TEN, 3e-3)
+    changes = [Change(1, 4, "jump", "r_p", 0.0937), Change(1, None, "driver", "", np.nan)]
+    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as view:
+        view.show(tick_of(tracker, 6, changes, reason="charge"))
+        found = shown(view)
+    assert set(found["words"]) == {"cap reached: charge"}
+    assert found["pulse"] == 7
+    assert [text for text in found["alarms"] if text] == [
+        "Pulse 7: cap reached: charge, at E1, E2, E3, E4, E5, E6 and 4 more",
+        "Pulse 7: the driver has changed; calibrate again",
+        "Pulse 7: jump of r_p, to 0.094 times its value, at E5",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"layout": Layout.grid(3, 3, 2e-3)}, "the layout has 9 electrodes, the display 10"),
+        ({"port": None}, r"port \d+ cannot be used .* does another live view run"),
+    ],
+)
+def test_a_view_that_cannot_be_is_refused(view, options, text):
+    options = {"port": 0, **options}
+    if options["port"] is None:
+        options["port"] = port_of(view)
+    with pytest.raises(ValueError, match=text):
+        LiveView(controller_of(TEN), charge=WANTED, controls=True, **options)
+
+
+def test_a_missing_tornado_is_named_with_its_extra(monkeypatch):
+    monkeypatch.setattr(views.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"needs tornado: pip install 'etid\[live\]'"):
+        LiveView(controller_of(TEN), charge=WANTED, controls=True)
+
+
+def resident(process):
+    """Memory of a process [bytes]."""
+    pages = pathlib.Path(f"/proc/{process.pid}/statm").read_text().split()[1]
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_the_loop_waits_for_no_page_and_no_memory_grows(monkeypatch):
+    """98 electrodes; a minute of snapshots while a page reads, then while its process is frozen."""
+    monkeypatch.setattr(views, "EVERY", 0.0)
+    tracker = tracker_of(DISPLAY, 3e-3)
+    with LiveView(controller_of(DISPLAY), charge=WANTED, controls=True, port=0) as view:
+        seconds, sizes, pid = [], [], view._process.pid
+        assert pid is not None
+
+        def hand_over(number):
+            tick = tick_of(tracker, number)
+            begin = time.thread_time(), time.monotonic()
+            view.show(tick)
+            seconds.append((time.thread_time() - begin[0], time.monotonic() - begin[1]))
+
+        for number in range(600):
+            hand_over(number)
+            if number % 2:
+                assert len(shown(view)["charge"]) == DISPLAY
+            if number in (100, 599):
+                sizes.append(resident(view._process))
+        assert sizes[1] - sizes[0] < 4e6
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            for number in range(600):
+                hand_over(number)
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        # A snapshot is due at every sixth pulse of 16.7 ms. The processor's time of this thread, as
+        # other tests run beside it; one that waited for a frozen process would wait for ever.
+        taken, passed = np.array(seconds).reshape(2, 600, 2).transpose(2, 0, 1)
+        assert (np.median(taken, axis=1) < 4e-3).all(), np.median(taken, axis=1)
+        assert passed.max() < 1.0
+        maps = pathlib.Path(f"/proc/{view._process.pid}/maps").read_text()
+        assert "jaxlib" not in maps, "the page's process takes no memory and cores of JAX"
+
+
+def test_a_page_that_has_died_is_a_stop():
+    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as view:
+        assert not view.stopped
+        view._process.kill()
+        view._process.join()
+        assert view.stopped
+
+
+def test_a_page_whose_program_was_killed_gives_its_port_back():
+    code = """
+import multiprocessing, socket, time
+import numpy as np
+from etid.live.server import Slot, serve
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    listening = socket.create_server(("127.0.0.1", 0))
+    slot = Slot(context, np.dtype([("pulse", int)]))
+    told = {"start": "", "token": "", "names": []}
+    context.Process(target=serve, args=(listening, slot, told), daemon=True).start()
+    print(listening.getsockname()[1], flush=True)
+    time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as program:
+        assert program.stdout is not None
+        port = int(program.stdout.readline())
+        program.kill()
+    for _ in range(200):
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=1).close()
+        except OSError:
+            return
+        time.sleep(0.1)
+    pytest.fail("the port is still taken")
+
+
+@contextlib.contextmanager
+def running(view, stimulator, controller):
+    """A controller that follows the stimulator, in a thread; yields its ticks."""
+    ticks = []
+
+    def run():
+        with connected(stimulator.address) as line:
+            stream = follow(received(line), controller, charge=WANTED, send=sender(line), view=view)
+            ticks.extend(tick._replace(window=None, before=None) for tick in stream)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield thread, ticks
+    finally:
+        view._slot.stop.value = 1
+        thread.join(60)
+
+
+def until(browser, expression):
+    """Wait until an expression of JavaScript is true."""
+    for _ in range(300):
+        if browser.evaluate(f"Boolean({expression})"):
+            return
+        time.sleep(0.1)
+    told = browser.evaluate("document.body.innerText")
+    pytest.fail(f"not within 30 s: {expression}\n{told}\n{browser.complaints}")
+
+
+def fill(name):
+    return f"document.querySelector('#value g[data-name={name}] circle').getAttribute('fill')"
+
+
+def test_a_browser_shows_the_skin_and_stops_it():
+    controller, stimulator = controller_of(TEN), Stimulator(TEN, pause=0.01)
+    with chromium() as browser:
+        with LiveView(controller, charge=WANTED, controls=True, port=0) as view:
+            with running(view, stimulator, controller) as (thread, ticks):
+                browser.open(view.address)
+                until(browser, "state?.pulse > 10 && state.words.every(word => word === 'good')")
+                # The picture changes when the skin does.
+                red = "+{}.match(/\\d+/)[0]".format
+                alike = f"Math.abs({red(fill('E4'))} - {red(fill('E5'))})"
+                assert browser.evaluate(alike) < 20
+                stimulator.skin[3], stimulator.skin[5] = "damp", "open"
+                until(browser, f"{alike} > 100 && {fill('E6')} === 'white'")
+                alarms = browser.evaluate("document.getElementById('alarms').innerText")
+                assert re.search(r"Pulse \d+: contact lost, at E6", alarms)
+                assert re.search(
+                    r"Pulse \d+: jump of r_\w, to 0\.\d+ times its value, at E4", alarms
+                )
+                mark = "document.querySelector('#charge g[data-name=E6] text').textContent"
+                assert browser.evaluate(mark) == "\u00d7"
+                # Another electrode's pulse, with its prediction.
+                click = "dispatchEvent(new MouseEvent('click'))"
+                browser.evaluate(f"document.querySelector('#value g[data-name=E4]').{click}")
+                until(browser, "state.electrode === 3 && state.predicted[0] !== null")
+                until(browser, "document.getElementById('electrode').value === 'E4'")
+                assert browser.evaluate("document.querySelectorAll('#pulse polyline').length") == 2
+                pair = np.array(browser.evaluate("[state.v_out, state.predicted]"))
+                measured, predicted = pair
+                assert np.ptp(measured) > 2
+                middle = slice(measured.size // 3, measured.size // 2)  # between the edges
+                np.testing.assert_allclose(predicted[middle], measured[middle], atol=0.1)
+                charges = np.array(browser.evaluate("state.charge"), float)
+                np.testing.assert_allclose(np.delete(charges, 5), 80, rtol=0.05)
+                # A second window stops both.
+                opened = "void (globalThis.second = window.open(location.href))"
+                browser.call("Runtime.evaluate", expression=opened, userGesture=True)
+                status = "document.getElementById('status').textContent"
+                until(browser, "second?.document.readyState === 'complete'")
+                until(browser, f"second.{status}.startsWith('pulse ')")
+                assert browser.complaints == []
+                assert {url.rpartition("/")[0] for url in browser.requests} == {view.address}
+                browser.evaluate("second.document.getElementById('stop').click()")
+                thread.join(30)
+                assert not thread.is_alive()
+                assert ticks[-1].stopped
+                assert not any(tick.stopped for tick in ticks[:-1])
+                for of in ("", "second."):
+                    until(browser, f"{of}{status}.startsWith('Stopped: no pulse was commanded')")
+            until(browser, f"document.getElementById('stop').disabled && {status} !== ''")
+        stimulator.thread.join(30)
+        given = np.array(stimulator.given)
+        assert (given[:-1].max(axis=1) > 0).all()
+        assert (given[-1] == 0).all(), "the stop is the last that the stimulator is told"
+        assert len(given) == len(ticks) + 1
+        until(browser, f"{status} === 'The program has ended after the stop.'")
+        # Another program at the same place: the page asks for its page, and has its token.
+        old = browser.evaluate("told.start")
+        with LiveView(controller, charge=WANTED, controls=False, port=port_of(view)) as again:
+            again.show(tick_of(controller.tracker))
+            until(browser, f"told.start !== '{old}' && state?.pulse === 1")
+            assert "watching only" in browser.evaluate(status)
+            browser.evaluate("act('electrode', '7')")
+            until(browser, f"told.start !== '{old}'")
+            for _ in range(100):
+                if again._slot.electrode.value == 7:
+                    break
+                time.sleep(0.1)
+            assert again._slot.electrode.value == 7
