@@ -105,6 +105,7 @@ def test_a_file_is_fitted_with_the_driver_of_another(scene, today, tmp_path, cap
     assert f"order {today.driver.order}, successful" in capsys.readouterr().out
     found = etid.StudyFits.read(fits)
     assert list(found.drivers) == [("driver.h5/calibration/98k8",)]
+    assert found.settings is not None
     assert found.settings.driver == str(driver)
     assert found.settings.source_sha256 == hashlib.sha256(source.read_bytes()).hexdigest()
     expected = etid.identify_skins(day, today.driver)

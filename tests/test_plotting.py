@@ -257,7 +257,9 @@ def test_fits_are_by_subject_and_failures_hollow():
     assert [label.get_text() for label in axes[-1].get_xticklabels()] == ["s01", "s02"]
     (medians,) = set(lines) - set(points)
     groups = [one for one in fits.summary("subject", "condition") if one["successful"] > 2]
-    np.testing.assert_allclose(medians.get_ydata(), [one["r_s"] / 1e3 for one in groups])
+    np.testing.assert_allclose(
+        np.asarray(medians.get_ydata()), [one["r_s"] / 1e3 for one in groups]
+    )
     (bars,) = axes[0].containers[-1][2]
     lengths = [np.ptp(segment[:, 1]) for segment in bars.get_segments()]
     np.testing.assert_allclose(lengths, [2e-3 * one["r_s_between"] for one in groups])

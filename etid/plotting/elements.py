@@ -68,7 +68,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
         medians, between = (
             np.array([one[name + part] for one in summary]) / scale for part in ("", "_between")
         )
-        axis.errorbar(middle, medians, between, fmt="_", ms=14, lw=5, color=INK, alpha=0.3)
+        axis.errorbar(middle, medians, between, fmt="_", ms=14, lw=2.5, color=INK, zorder=4)
         axis.set_yscale("log")
         shown = known
         if (good & known).any():  # an undetermined element may lie decades away

@@ -31,7 +31,7 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.precision import in_float64
-from etid.recordings.fields import tidy_path
+from etid.recordings.fields import LABELS, tidy_path
 from etid.recordings.recording import Recording, Samples
 from etid.recordings.study import Study
 from etid.simulation.published import BUILT, FINGERTIPS, REFERENCE, TABLE_1, TYPICAL
@@ -55,6 +55,8 @@ class Trial:
         load: The load: one of `etid.simulation.transformer`, a circuit, or any function from
             frequencies [Hz] to impedance [ohm].
         subject: Label of the person.
+        session: Label of the day.
+        site: Label of the finger.
         condition: State of the skin.
         electrode: Label of the electrode.
         trial: Label of the repetition.
@@ -66,6 +68,8 @@ class Trial:
     condition: str = ""
     electrode: str = ""
     trial: str = ""
+    session: str = ""
+    site: str = ""
 
     def __post_init__(self) -> None:
         if not self.path or tidy_path(self.path) != self.path:
@@ -238,10 +242,7 @@ class Scene:
                     sample_rate=self.sample_rate,
                     pulse_rate=self.pulse_rate,
                     r_load=r_load,
-                    subject=trial.subject,
-                    condition=trial.condition,
-                    electrode=trial.electrode,
-                    trial=trial.trial,
+                    **{name: getattr(trial, name) for name in LABELS},
                     calibration=tuple(resistances) if r_load is None else (),
                     adc_range=(lowest * step / self.scale, highest * step / self.scale),
                     path=trial.path,
