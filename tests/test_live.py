@@ -203,6 +203,7 @@ def test_alarms_are_words():
     ("options", "text"),
     [
         ({"layout": Layout.grid(3, 3, 2e-3)}, "the layout has 9 electrodes, the display 10"),
+        ({"port": 70_000}, r"port 70000 cannot be used"),
         ({"port": None}, r"port \d+ cannot be used .* does another live view run"),
     ],
 )
@@ -378,6 +379,8 @@ def test_a_browser_shows_the_skin_and_stops_it():
                 assert not any(tick.stopped for tick in ticks[:-1])
                 for of in ("", "second."):
                     until(browser, f"{of}{status}.startsWith('Stopped: no pulse was commanded')")
+                charges = np.array(browser.evaluate("state.charge"), float)
+                np.testing.assert_allclose(np.delete(charges, 5), 80, rtol=0.05)
             until(browser, f"document.getElementById('stop').disabled && {status} !== ''")
         stimulator.thread.join(30)
         given = np.array(stimulator.given)

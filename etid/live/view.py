@@ -110,9 +110,10 @@ class LiveView:
         }
         try:
             listening = socket.create_server(("127.0.0.1", port))
-        except OSError as error:
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
             raise ValueError(
-                f"port {port} cannot be used ({error.strerror}); does another live view run? End "
+                f"port {port} cannot be used ({reason}); does another live view run? End "
                 "it, or name another port"
             ) from None
         self.address = f"http://127.0.0.1:{listening.getsockname()[1]}"
@@ -159,7 +160,8 @@ class LiveView:
         own = np.asarray(state.own)
         known = np.asarray(state.pulses) > 0
         of["elements"] = np.where(known, np.exp(own[:, :-1].T) / self._scale[:, None], np.nan)
-        of["charge"] = self._given(tick) / NANO
+        if not tick.stopped:  # its command is 0, which tells no charge of the pulse before
+            of["charge"] = self._given(tick) / NANO
         of["words"] = [word.encode() for word in self._words]
         of["v_out"] = tick.window[at, self._part]
         of["predicted"] = self._predicted(tick, at)
@@ -212,8 +214,7 @@ class LiveView:
     def _given(self, tick: "Tick") -> Float[np.ndarray, " lane"]:
         """Charge per phase that the last pulse gave, with the elements after it [C]."""
         amplitude, command = np.asarray(tick.state.electrodes.amplitude), tick.command
-        none = command.amplitude == 0  # after a stop
-        per_unit = command.charge / np.where(none, np.nan, command.amplitude)
+        per_unit = command.charge / np.where(command.amplitude > 0, command.amplitude, np.nan)
         return np.where(amplitude == 0, 0.0, per_unit * amplitude)
 
     def _predicted(self, tick: "Tick", at: int) -> Float[np.ndarray, " sample"]:
