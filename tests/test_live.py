@@ -203,7 +203,7 @@ def test_alarms_are_words():
     ("options", "text"),
     [
         ({"layout": Layout.grid(3, 3, 2e-3)}, "the layout has 9 electrodes, the display 10"),
-        ({"port": 70_000}, r"port 70000 cannot be used"),
+        ({"port": 70_000}, "port is 70000; give a number from 0 to 65535"),
         ({"port": None}, r"port \d+ cannot be used .* does another live view run"),
     ],
 )
@@ -261,6 +261,18 @@ def test_the_loop_waits_for_no_page_and_no_memory_grows(monkeypatch):
         assert passed.max() < 1.0
         maps = pathlib.Path(f"/proc/{view._process.pid}/maps").read_text()
         assert "jaxlib" not in maps, "the page's process takes no memory and cores of JAX"
+
+
+def test_a_slow_tick_is_not_shown():
+    tracker = tracker_of(TEN, 3e-3)
+    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as view:
+        view.show(tick_of(tracker, 0))
+        view._due = time.monotonic() - 0.1
+        view.show(tick_of(tracker, 1)._replace(seconds=0.01))  # of 16.7 ms
+        assert shown(view)["pulse"] == 1
+        view._due = time.monotonic() - 1.1
+        view.show(tick_of(tracker, 2)._replace(seconds=0.01))
+        assert shown(view)["pulse"] == 3
 
 
 def test_a_page_that_has_died_is_a_stop():

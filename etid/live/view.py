@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 PORT = 8765
 EVERY = 0.1  # [s] between two snapshots
+LATEST = 1.0  # [s] after which a snapshot does not wait for a quick tick
 LAST = 0.5  # [s] that the windows have to see the last one
 COLUMNS = 7  # electrodes in a row of the paper's display
 ALARMS = 12  # alarms that are listed
@@ -68,7 +69,7 @@ class LiveView:
 
         Raises:
             ValueError: Tornado is missing, the layout has another number of electrodes, or the port
-                is in use.
+                is in use or no port.
         """
         if importlib.util.find_spec("tornado") is None:
             raise ValueError(
@@ -76,6 +77,8 @@ class LiveView:
             )
         from etid.live.server import Slot, serve  # here, because it imports tornado
 
+        if not 0 <= port < 2**16:
+            raise ValueError(f"port is {port}; give a number from 0 to {2**16 - 1}")
         tracker = controller.tracker
         number, bands, circuit = tracker.electrodes, tracker.model.bands, tracker.model.circuit
         layout = layout or _rows(number)
@@ -110,10 +113,9 @@ class LiveView:
         }
         try:
             listening = socket.create_server(("127.0.0.1", port))
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
+        except OSError as error:
             raise ValueError(
-                f"port {port} cannot be used ({reason}); does another live view run? End "
+                f"port {port} cannot be used ({error.strerror}); does another live view run? End "
                 "it, or name another port"
             ) from None
         self.address = f"http://127.0.0.1:{listening.getsockname()[1]}"
@@ -126,6 +128,7 @@ class LiveView:
         with listening:  # the other process has it
             self._process.start()
         self._due = self._slowest = 0.0
+        self._spare = tracker.period / bands.sample_rate / 2
         self._words = [UNKNOWN] * number
         self._alarms: deque[str] = deque(maxlen=ALARMS)
         self._compile()
@@ -136,7 +139,10 @@ class LiveView:
         return bool(self._slot.stop.value) or not self._process.is_alive()
 
     def show(self, tick: "Tick") -> None:
-        """Hand over a tick, at most ten times a second, and the last one."""
+        """Hand over a tick, at most ten times a second, and the last one.
+
+        A tick that took half of its period is not shown, unless none was shown for a second.
+        """
         pulse = f"Pulse {tick.number + 1}: "
         for change in tick.changes:
             if change.electrode is None:
@@ -148,9 +154,11 @@ class LiveView:
                 )
             self._alarms.appendleft(pulse + text)
         self._slowest = max(self._slowest, tick.seconds)
-        if time.monotonic() < self._due and not tick.stopped:
+        now = time.monotonic()
+        wait = now < self._due or (tick.seconds > self._spare and now < self._due + LATEST)
+        if wait and not tick.stopped:
             return
-        self._due = time.monotonic() + EVERY
+        self._due = now + EVERY
         self._alarm(pulse, self._seen(tick))
         state = tick.state.electrodes
         at = min(self._slot.electrode.value, len(self._names) - 1)
