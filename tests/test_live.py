@@ -330,9 +330,10 @@ def running(view, stimulator, controller):
 
 
 def until(browser, expression):
-    """Wait until an expression of JavaScript is true."""
+    """Wait until an expression of JavaScript is true; a page that is being loaded has no names."""
+    tried = f"(() => {{ try {{ return Boolean({expression}) }} catch {{ return false }} }})()"
     for _ in range(300):
-        if browser.evaluate(f"Boolean({expression})"):
+        if browser.evaluate(tried):
             return
         time.sleep(0.1)
     told = browser.evaluate("document.body.innerText")
@@ -380,7 +381,6 @@ def test_a_browser_shows_the_skin_and_stops_it():
                 opened = "void (globalThis.second = window.open(location.href))"
                 browser.call("Runtime.evaluate", expression=opened, userGesture=True)
                 status = "document.getElementById('status').textContent"
-                until(browser, "second?.document.readyState === 'complete'")
                 until(browser, f"second.{status}.startsWith('pulse ')")
                 assert browser.complaints == []
                 assert {url.rpartition("/")[0] for url in browser.requests} == {view.address}
@@ -407,7 +407,6 @@ def test_a_browser_shows_the_skin_and_stops_it():
             until(browser, f"told.start !== '{old}' && state?.pulse === 1")
             assert "watching only" in browser.evaluate(status)
             browser.evaluate("act('electrode', '7')")
-            until(browser, f"told.start !== '{old}'")
             for _ in range(100):
                 if again._slot.electrode.value == 7:
                     break
