@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 PORT = 8765
 EVERY = 0.1  # [s] between two snapshots
+LATEST = 1.0  # [s] after which a snapshot does not wait for a quick tick
 LAST = 0.5  # [s] that the windows have to see the last one
 COLUMNS = 7  # electrodes in a row of the paper's display
 ALARMS = 12  # alarms that are listed
@@ -68,7 +69,7 @@ class LiveView:
 
         Raises:
             ValueError: Tornado is missing, the layout has another number of electrodes, or the port
-                is in use.
+                is in use or no port.
         """
         if importlib.util.find_spec("tornado") is None:
             raise ValueError(
@@ -76,6 +77,8 @@ class LiveView:
             )
         from etid.live.server import Slot, serve  # here, because it imports tornado
 
+        if not 0 <= port < 2**16:
+            raise ValueError(f"port is {port}; give a number from 0 to {2**16 - 1}")
         tracker = controller.tracker
         number, bands, circuit = tracker.electrodes, tracker.model.bands, tracker.model.circuit
         layout = layout or _rows(number)
@@ -125,6 +128,7 @@ class LiveView:
         with listening:  # the other process has it
             self._process.start()
         self._due = self._slowest = 0.0
+        self._spare = tracker.period / bands.sample_rate / 2
         self._words = [UNKNOWN] * number
         self._alarms: deque[str] = deque(maxlen=ALARMS)
         self._compile()
@@ -135,7 +139,10 @@ class LiveView:
         return bool(self._slot.stop.value) or not self._process.is_alive()
 
     def show(self, tick: "Tick") -> None:
-        """Hand over a tick, at most ten times a second, and the last one."""
+        """Hand over a tick, at most ten times a second, and the last one.
+
+        A tick that took half of its period is not shown, unless none was shown for a second.
+        """
         pulse = f"Pulse {tick.number + 1}: "
         for change in tick.changes:
             if change.electrode is None:
@@ -147,9 +154,11 @@ class LiveView:
                 )
             self._alarms.appendleft(pulse + text)
         self._slowest = max(self._slowest, tick.seconds)
-        if time.monotonic() < self._due and not tick.stopped:
+        now = time.monotonic()
+        wait = now < self._due or (tick.seconds > self._spare and now < self._due + LATEST)
+        if wait and not tick.stopped:
             return
-        self._due = time.monotonic() + EVERY
+        self._due = now + EVERY
         self._alarm(pulse, self._seen(tick))
         state = tick.state.electrodes
         at = min(self._slot.electrode.value, len(self._names) - 1)
@@ -159,7 +168,8 @@ class LiveView:
         own = np.asarray(state.own)
         known = np.asarray(state.pulses) > 0
         of["elements"] = np.where(known, np.exp(own[:, :-1].T) / self._scale[:, None], np.nan)
-        of["charge"] = self._given(tick) / NANO
+        if not tick.stopped:  # its command is 0, which tells no charge of the pulse before
+            of["charge"] = self._given(tick) / NANO
         of["words"] = [word.encode() for word in self._words]
         of["v_out"] = tick.window[at, self._part]
         of["predicted"] = self._predicted(tick, at)
@@ -212,8 +222,7 @@ class LiveView:
     def _given(self, tick: "Tick") -> Float[np.ndarray, " lane"]:
         """Charge per phase that the last pulse gave, with the elements after it [C]."""
         amplitude, command = np.asarray(tick.state.electrodes.amplitude), tick.command
-        none = command.amplitude == 0  # after a stop
-        per_unit = command.charge / np.where(none, np.nan, command.amplitude)
+        per_unit = command.charge / np.where(command.amplitude > 0, command.amplitude, np.nan)
         return np.where(amplitude == 0, 0.0, per_unit * amplitude)
 
     def _predicted(self, tick: "Tick", at: int) -> Float[np.ndarray, " sample"]:
