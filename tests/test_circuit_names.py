@@ -152,19 +152,6 @@ def test_an_unknown_circuit_is_one_error(files, tmp_path, stored, says):
         etid.Fits.read(other)
 
 
-def test_a_circuit_that_has_changed_is_refused(files, tmp_path):
-    class Spread(etid.AbstractCircuit):
-        outer: float = etid.parameter("ohm", typical=1.0)
-
-        def impedance(self):
-            return etid.resistor(self.outer)
-
-    with pytest.raises(etid.RecordingError, match=r"Spread has outer\. Pass the class as it was"):
-        etid.Fits.read("fits.h5", Spread)
-    with pytest.raises(etid.RecordingError, match="that was passed is SkinRC: pass Spread"):
-        etid.Fits.read("fits.h5", etid.SkinRC)
-
-
 @pytest.mark.parametrize(
     ("name", "says"),
     [

@@ -1,11 +1,9 @@
 """The command line: what it prints, what it writes, how it ends."""
 
-import importlib
 import json
 import os
 import pathlib
 import re
-import shutil
 import subprocess
 import sys
 
@@ -81,21 +79,6 @@ def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_pat
     assert not np.array_equal(records[0], records[2])
     truth = json.loads((tmp_path / "t.json").read_text())
     assert truth["typical/dry/03"] == {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
-
-
-def test_simulate_passes_noise_and_delay_on(run, tmp_path):
-    for name, options in {
-        "clean": ("--snr-db", "inf"),
-        "noise": ("--snr-db", 30),
-        "delay": ("--snr-db", "inf", "--jitter", 1e-6),
-    }.items():
-        assert run("simulate", "paper_calibration", "-o", tmp_path / f"{name}.h5", *options)[0] == 0
-    v = {name: etid.read(tmp_path / f"{name}.h5")["calibration/98k8"].v_th
-         for name in ("clean", "noise", "delay")}  # fmt: skip
-    quiet = slice(1000, 3000)  # between two pulses: noise is seen there, a delay is not
-    assert np.std(np.diff(v["noise"][quiet])) > 10 * np.std(np.diff(v["clean"][quiet]))
-    assert np.std(np.diff(v["delay"][quiet])) < 2 * np.std(np.diff(v["clean"][quiet]))
-    assert np.abs(v["delay"] - v["clean"]).max() > 1.0  # at the edges of 50 V
 
 
 def test_check_names_every_wrong_field(run, study_file):
@@ -323,29 +306,6 @@ def test_json_of_fit_has_what_the_text_has(run, study_file, tmp_path):
     assert failed["note"]
 
 
-def test_json_of_a_fit_without_success_has_null_for_what_is_no_number(
-    run, without_driver, tmp_path
-):
-    target = tmp_path / "fits.h5"
-    status, printed, _ = run("fit", without_driver, "-o", target, "--json")
-    data = as_json(printed)
-    assert status == data["status"] == WRONG_DATA
-    assert data["verdicts"] == {"driver_failed": 23}
-    assert len(data["unsuccessful"]) == 23
-    assert data["groups"][0]["r_s"] is None
-    assert data["drivers"][0]["error"].startswith("calibration 'calibration/98k8': flat.")
-
-
-def test_json_of_check_has_a_place_for_every_problem(run, study_file):
-    status, printed, _ = run("check", study_file, "--json")
-    data = as_json(printed)
-    assert status == data["status"] == WRONG_DATA
-    (problem,) = data["problems"]
-    assert (problem["path"], problem["field"]) == ("typical/dry/02", "v_out")
-    assert problem["message"]
-    assert problem["remedy"]
-
-
 def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(run, study_file, tmp_path):
     page = (pathlib.Path(__file__).parents[1] / "docs" / "command_line.md").read_text("utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", page, flags=re.MULTILINE))
@@ -419,12 +379,6 @@ assert not {{"jax", "equinox", "h5py"}} & set(sys.modules)
     assert done.returncode == 0, done.stderr
 
 
-def test_every_command_says_what_its_module_does():
-    for module, summary in cli.COMMANDS.values():
-        (first, *_) = str(importlib.import_module(f"etid.commands.{module}").__doc__).splitlines()
-        assert summary == first[0].lower() + first[1:].rstrip(".")
-
-
 @pytest.mark.parametrize(
     "arguments",
     [(), ("nonsense",), ("fit", "study.h5"), ("simulate", "nonsense", "-o", "x.h5"),
@@ -475,33 +429,3 @@ def test_completion_is_offered_for_every_shell_there_is_one_for(run):
         status, printed, complaints = run("--completion", shell)
         assert (status, complaints) == (DONE, [])
         assert any("snr-db" in line for line in printed)
-
-
-@pytest.mark.parametrize(
-    ("words", "offered"),
-    [
-        (("simul",), ["simulate"]),
-        (("fit", "--meth"), ["--method"]),
-        (("fit", "--method", "output"), ["output_error"]),
-        (("check", "stu"), ["study.h5"]),
-        (("fit", "-o", "stu"), ["study.h5"]),
-    ],
-)
-def test_completion_completes_commands_options_choices_and_files(
-    run, tmp_path, monkeypatch, words, offered
-):
-    bash = shutil.which("bash")
-    if bash is None:
-        pytest.skip("there is no bash")
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "study.h5").touch()
-    _, script, _ = run("--completion", "bash")
-    ask = f"""
-    COMP_WORDS=(etid {" ".join(words)}); COMP_CWORD={len(words)}
-    _shtab_etid etid "${{COMP_WORDS[COMP_CWORD]}}" "${{COMP_WORDS[COMP_CWORD-1]}}"
-    printf '%s\\n' "${{COMPREPLY[@]}}"
-    """
-    done = subprocess.run(
-        [bash, "-c", "\n".join(script) + ask], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == offered

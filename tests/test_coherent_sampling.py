@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify.options import for_calibrations
-from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import ALIASED, aliases
 from etid.simulation.transformer import TransformerDriver
 
@@ -136,23 +134,6 @@ def test_a_joint_fit_takes_such_records():
         assert np.abs(off(fit, name)).max() < SIGMAS
 
 
-@pytest.mark.slow
-def test_a_tracker_takes_the_default_driver():
-    """It refused this driver, because output error had identified it."""
-    bench = Bench(seed=2, periods=50)
-    known, skins = bench.calibration(), [bench.loaded(name) for name in SKINS]
-    tracker = etid.Tracker.of(etid.identify_driver(known), known, electrodes=2)
-    state = tracker.start()
-    size = round(RATE / PULSES)
-    for pulse in range(bench.periods):
-        part = slice(pulse * size, (pulse + 1) * size)
-        state = tracker.update(state, np.stack([skin.v_out[part] for skin in skins]))
-    fits = tracker.read(state)
-    for fit, name in each(fits):
-        assert fit.verdict == "successful"
-        assert np.abs(off(fit, name)).max() < SIGMAS
-
-
 def test_without_a_filter_the_records_are_biased():
     """Maximum likelihood would be up to fifty of its standard errors off."""
     with pytest.raises(etid.IdentificationError, match=r"'calibration': biased.*anti-alias filter"):
@@ -166,14 +147,6 @@ def test_without_a_filter_the_records_are_biased():
     assert all("biased" in note for note in joint.fits.notes)
     with pytest.raises(etid.IdentificationError, match="biased"):
         etid.Tracker.of(driver, study(False)["calibration"], electrodes=1)
-
-
-def test_noise_above_the_aliases_needs_no_filter():
-    of = {"seed": 3, "rate": 500e3, "pulses": 50.0, "filtered": False}
-    noisy, quiet = (Inspected(Bench(snr_db=snr, **of).calibration()) for snr in (40.0, 80.0))
-    assert not noisy.is_aliased
-    assert str(for_calibrations(None, [noisy])) == "maximum_likelihood"
-    assert quiet.is_aliased
 
 
 def exact(bench, coefficients):
@@ -215,13 +188,6 @@ def test_a_spectrum_that_ends_in_the_noise_has_no_aliases():
     of = aliases(pulse + parts[0] + 1j * parts[1], noise, 5, 20_000)
     assert not of.power.any()
     assert not of.are_unknown(noise)
-
-
-def test_a_spectrum_that_does_not_fall_is_not_continued():
-    noise = np.full(2000, 1e-6)
-    of = aliases(np.full(2000, 1 + 0j), noise, 5, 20_000)
-    np.testing.assert_allclose(of.power[:1400], 1.0, rtol=1e-5)
-    assert of.are_unknown(noise)
 
 
 def test_a_spectrum_that_falls_with_a_power_has_the_aliases_of_this_power():
@@ -274,18 +240,4 @@ def test_behind_a_filter_the_elements_are_within_their_errors(rate, pulses, peri
 def test_without_a_filter_no_fit_is_silently_wrong(rate, pulses):
     errors, others = drawn(18, LEVELS, rate=rate, pulses=pulses, filtered=False)
     assert others.count("biased") >= 0.75 * 36
-    assert not errors.size or np.abs(errors).max() < SIGMAS
-
-
-@pytest.mark.slow
-def test_100_khz_are_too_slow_for_edges_that_ring_at_60_khz():
-    errors, others = drawn(8, LEVELS[:2], rate=100e3, pulses=50.0)
-    assert set(others) <= {"biased", "insensitive"}
-    assert not errors.size or np.abs(errors).max() < SIGMAS
-
-
-@pytest.mark.slow
-def test_a_method_that_takes_aliases_for_noise_says_that_it_is_biased():
-    errors, others = drawn(5, (60.0,), "non_parametric", rate=240e3, pulses=60.0)
-    assert others.count("biased") > len(errors)
     assert not errors.size or np.abs(errors).max() < SIGMAS

@@ -112,25 +112,6 @@ def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_pa
     assert about.items() <= schema.metadata.items()
 
 
-def test_fits_of_a_circuit_of_ones_own_are_exported_without_its_class(file, tmp_path):
-    with h5py.File(file, "a") as content:
-        content.attrs.update(circuit="Mine", parameters=["r_a"])
-        for ending in ("", "_stderr", "_change"):
-            content.move(f"r_s{ending}", f"r_a{ending}")
-    etid.export_fits(file, tmp_path / "table.csv")
-    head = (tmp_path / "table.csv").read_text("utf-8").splitlines()[0]
-    assert "r_a [ohm],r_a_stderr [ohm],r_a_change,amplitude_change,rrse" in head
-    assert "r_p" not in head
-
-
-def test_no_fit_is_an_empty_table(fits, tmp_path):
-    fits.take(np.zeros(COUNT, bool)).write(tmp_path / "none.h5")
-    etid.export_fits(tmp_path / "none.h5", tmp_path / "none.csv")
-    assert len((tmp_path / "none.csv").read_text("utf-8").splitlines()) == 1
-    etid.export_fits(tmp_path / "none.h5", tmp_path / "none.parquet")
-    assert parquet.read_table(tmp_path / "none.parquet").num_rows == 0
-
-
 def test_a_netlist_is_that_of_the_identified_circuit(fits, file, tmp_path):
     target = tmp_path / "skin.cir"
     etid.export_circuit(file, target, "path 7")
@@ -155,12 +136,6 @@ def test_a_circuit_of_impedance_py_has_the_identified_values(fits, file, tmp_pat
     elements = fits[7].circuit
     expected = [float(value) for value in (elements.r_s, elements.r_p, elements.c_p)]
     assert (string, values) == ("R0-p(R1,C1)", expected)
-
-
-def test_a_single_fit_needs_no_path(fits, tmp_path):
-    fits.take(np.arange(COUNT) == 3).write(tmp_path / "one.h5")
-    etid.export_circuit(tmp_path / "one.h5", tmp_path / "one.cir")
-    assert ".subckt load_path_3 plus minus" in (tmp_path / "one.cir").read_text("utf-8")
 
 
 @pytest.mark.parametrize(
@@ -241,24 +216,6 @@ def test_nwb_holds_what_was_stored_and_all_that_was_said(study_file, tmp_path):
             np.testing.assert_array_equal(row["adc_range"], limits)
             load = np.nan if recording.r_load is None else recording.r_load
             np.testing.assert_array_equal(row["r_load"], load)
-
-
-def test_nwb_stores_a_shared_unloaded_record_once(study_file, tmp_path):
-    target = tmp_path / "study.nwb"
-    etid.export_study(study_file, target, session_start=START)
-    with h5py.File(target) as file:
-        names = [f"acquisition/s01.dry.{i}.v_th/data" for i in range(3)]
-        assert file[names[1]] == file[names[0]] == file[names[2]]
-        assert file["acquisition/s01.dry.0.v_out/data"] != file["acquisition/s01.dry.1.v_out/data"]
-
-
-def test_nwb_of_several_subjects_names_none_for_the_whole_file(study_file, tmp_path):
-    with h5py.File(study_file, "a") as file:
-        file["s01/damp"].attrs["subject"] = "s02"
-    etid.export_study(study_file, tmp_path / "study.nwb", session_start=START)
-    with opened(tmp_path / "study.nwb") as file:
-        assert file.subject is None
-        assert set(file.acquisition["recordings"]["subject"][:]) == {"s01", "s02"}
 
 
 def test_records_whose_names_nwb_cannot_tell_apart_are_refused(study_file, tmp_path):

@@ -124,11 +124,6 @@ def test_data_that_were_scaled_before_they_were_written_are_not_scaled_again(tmp
     np.testing.assert_allclose(imported(path, pair())[0]["loaded/0"].v_out, V_OUT / 0.0535)
 
 
-def test_a_temperature_is_no_voltage(tmp_path):
-    own = {**LINE, "NI_Scale[0]_Scale_Type": "Thermocouple"}
-    refused(rig(tmp_path, V_TH, CODES, **own), pair(), r"'rig/skin' has the scaling Thermocoup")
-
-
 def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
     path = tmp_path / "rig.tdms"
     with TdmsWriter(path) as writer:
@@ -207,11 +202,6 @@ def test_an_abf_file_that_declares_more_tags_than_it_has_bytes_is_refused(tmp_pa
     refused(path, SWEEPS, f"declares {2**30} entries")
 
 
-def test_a_channel_in_amperes_is_no_voltage(tmp_path):
-    path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]), unit="pA")
-    refused(path, SWEEPS, r"v_th.unit: .* is in ampere \(file\)")
-
-
 # CSV
 
 
@@ -225,12 +215,6 @@ def test_units_of_a_table_may_stand_in_its_first_or_second_line(head, tmp_path):
     path.write_text(f"{head}\n1,2\n3,4\n\n5,6\n", encoding="utf-8")
     recordings, _ = imported(path, pair("open", "skin", sample_rate=2e5))
     np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 53.5)
-
-
-def test_a_bracket_that_holds_no_unit_belongs_to_the_name(tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text("V (left),V (right)\n1,2\n3,4\n", encoding="utf-8")
-    refused(path, pair("V", "V", sample_rate=2e5), r"there is no 'V'; .* 'V \(left\)', 'V \(right")
 
 
 def test_a_table_without_names_has_numbered_columns(tmp_path):
@@ -252,21 +236,6 @@ def test_a_preamble_may_stand_beside_the_numbers(tmp_path):
     np.testing.assert_allclose(recordings["loaded/0"].v_out, np.arange(0, 10, 2) / 0.0535)
 
 
-def test_the_clock_may_start_beside_the_units(tmp_path):
-    path = tmp_path / "rigol.csv"
-    path.write_text(
-        "X,CH1,CH2,Start,Increment,\nSequence,VOLT,VOLT,-6e-3,5e-6\n0,1,2,\n1,3,4,\n2,5,6,\n",
-        encoding="utf-8",
-    )
-    told = {**GIVEN, "sample_rate": 2e5, "v_th": {"channel": "CH1"}, "v_out": {"channel": "CH2"}}
-    recordings, [used] = imported(path, told)
-    np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 0.0535)
-    assert str(used.signals["v_out"]).startswith("'CH2' in VOLT (file)")
-    path.with_suffix(".h5").unlink()
-    del told["sample_rate"]
-    refused(path, {**told, "time": {"channel": "X"}}, "the file says 'Sequence' of channel 'X'")
-
-
 def test_v_th_may_be_a_channel_of_another_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = columns("open.csv:a", "skin", sample_rate=2e5)
@@ -283,13 +252,6 @@ def test_v_th_may_be_a_channel_of_another_file(tmp_path, monkeypatch):
     pathlib.Path("open.csv").write_text("a\n1\n2\nx\n", encoding="utf-8")
     with pytest.raises(RecordingError, match=r"^open\.csv: cannot be read"):
         etid.import_file(finger, "t.h5", told)
-
-
-def test_columns_that_are_not_asked_for_may_hold_anything(tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text("note,open [V],skin [V]\nfine,1,2\n,3,4\n", encoding="utf-8")
-    recordings, _ = imported(path, pair("open", "skin", sample_rate=2e5))
-    assert recordings["loaded/0"].v_out.size == 2
 
 
 # Parts
@@ -342,13 +304,6 @@ def test_time_stamps_are_checked_in_every_part(small_parts, tmp_path):
         refused(path, said, r"time: is not uniform: sample \d+")
 
 
-def test_a_wrong_number_far_down_a_table_is_found_and_counted(small_parts, tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text("open [V],skin [V]\n" + "1,2\n" * 100 + "1,?\n", encoding="utf-8")
-    said = pair("open", "skin", sample_rate=2e5)
-    refused(path, said, r"cannot be read .*'\?'.*counted from row 92")
-
-
 # For all
 
 
@@ -371,15 +326,6 @@ def test_without_its_reader_a_file_names_what_to_install(name, package, tmp_path
 def test_a_damaged_file_is_an_error_of_that_file(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     refused(tmp_path / name, pair(), re.escape(name))
-
-
-def test_nan_samples_are_kept_for_a_verdict(tmp_path):
-    holes = np.where(np.arange(1000) == 5, np.nan, V_OUT)
-    target = tmp_path / "rig.h5"
-    etid.import_file(rig(tmp_path, V_TH, holes), target, pair())
-    with etid.read(target) as study:
-        assert np.isnan(study["loaded/0"].v_out).sum() == 1
-    assert [problem.field for problem in etid.check(target)] == ["v_out"]
 
 
 def test_units_are_those_of_the_si_and_their_names():

@@ -168,19 +168,3 @@ def test_a_device_is_not_replaced_by_a_file(capsys):
     assert cli.main(["simulate", "paper_dry", "-o", os.devnull, "--force"]) == 1
     assert "this is a device or a pipe; name a file" in capsys.readouterr().err
     assert not pathlib.Path(os.devnull).is_file()
-
-
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")
-def test_an_output_that_cannot_be_printed_is_one_line(study):
-    with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "etid", "check", study],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
-    assert done.returncode == 1
-    assert done.stderr == (
-        "etid: error: the output cannot be written ([Errno 28] No space left on device)\n"
-    )

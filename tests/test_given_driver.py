@@ -1,12 +1,9 @@
 """What calibrations tell of a driver: its covariance is that of the noise, by sums written down."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
 from jax.flatten_util import ravel_pytree
 
 import etid
@@ -89,29 +86,3 @@ def test_what_a_calibration_tells_is_one_standard_deviation_along_each_direction
     np.testing.assert_allclose(still, z, rtol=1e-9)
     moved = known.z_th(jnp.full(frequency.size, 0.1 + 0.05j))
     np.testing.assert_allclose(moved, (z + R_LOAD) * np.exp(0.1 + 0.05j) - R_LOAD, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_what_drifts_after_the_calibration_is_one_more_z_for_each_parameter(driver):
-    """∂W/∂z = σ ∂Z_th/∂p / (Z_th + R); the calibrations tell nothing about it."""
-    later, frequency = (
-        dataclasses.replace(driver, drift=jnp.asarray(0.01)),
-        driver.spectra.frequency[0],
-    )
-    before, known = (MAXIMUM_LIKELIHOOD.known(d, frequency, True) for d in (driver, later))
-    assert isinstance(before, GivenDriver)
-    assert isinstance(known, GivenDriver)
-    std, old = np.asarray(later.drift_std()), before.mean.size
-    np.testing.assert_allclose(known.mean, [*before.mean, *(0 * std)], atol=1e-9)
-    expected = scipy.linalg.block_diag(before.cov, np.eye(std.size))
-    np.testing.assert_allclose(known.cov, np.asarray(expected), atol=1e-9)
-    parameters, unflatten = ravel_pytree(later.source)
-    slope = jax.jacfwd(lambda p: unflatten(p).response(frequency))(parameters)
-    loaded = np.asarray(later.response(frequency)) + R_LOAD
-    moved = std[:, None] * np.asarray(slope).T / loaded
-    np.testing.assert_allclose(known.slope[old:], moved, atol=1e-9 * abs(moved).max())
-    np.testing.assert_allclose(known.slope[:old], before.slope, atol=1e-9)
-    assert known.gain_slopes is not None
-    assert before.gain_slopes is not None
-    assert not np.asarray(known.gain_slopes[old:]).any()
-    np.testing.assert_allclose(known.gain_slopes[:old], before.gain_slopes, atol=1e-9)

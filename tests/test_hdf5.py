@@ -9,7 +9,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from etid.recordings import contents as scan
 from etid.recordings import hdf5
 from etid.recordings.fields import SIGNALS
 from etid.recordings.recording import Recording, RecordingError, Samples
@@ -94,21 +93,6 @@ def test_rows_of_a_stack_are_recordings_with_their_own_label_and_a_common_v_th(p
         assert study[one.calibration[0]].r_load == 98.8e3
 
 
-def test_numbers_in_paths_are_ordered_by_value(path, edit):
-    def copies(file):
-        for name in ("s10", "s2", "s1"):
-            file.copy("s01/damp", name)
-
-    with hdf5.read(edit(copies)) as study:
-        assert list(study)[1:] == [
-            "s01/damp",
-            *(f"s01/dry/{i}" for i in range(3)),
-            "s1",
-            "s2",
-            "s10",
-        ]
-
-
 def test_samples_are_not_read_before_they_are_asked_for(path, monkeypatch):
     with hdf5.read(path) as study:
         monkeypatch.setattr(h5py.Dataset, "__getitem__", None)
@@ -118,13 +102,6 @@ def test_samples_are_not_read_before_they_are_asked_for(path, monkeypatch):
         assert "s01/dry/2" in study
         with pytest.raises(RecordingError, match="cannot read it"):
             study["s01/damp"]
-
-
-def test_a_closed_study_says_so(path):
-    with hdf5.read(path) as study:
-        part = study.loaded
-    with pytest.raises(RecordingError, match="the file is closed"):
-        part["s01/damp"]
 
 
 @pytest.mark.parametrize("link", [h5py.SoftLink("/s01/dry/v_th"), None])
@@ -137,20 +114,6 @@ def test_records_may_be_shared_by_links_inside_the_file(edit, link):
     assert hdf5.check(path) == []
     with hdf5.read(path) as study:
         np.testing.assert_array_equal(study["s01/damp"].samples["v_th"].stored, CODES[0])
-
-
-def test_big_endian_and_compressed_records_are_read(edit):
-    def replace(file):
-        for name, dtype in (("v_th", ">i4"), ("v_out", ">f4")):
-            attributes = dict(file[f"s01/damp/{name}"].attrs)
-            del file[f"s01/damp/{name}"]
-            data = CODES[0].astype(dtype)
-            file["s01/damp"].create_dataset(name, data=data, compression="gzip")
-            file[f"s01/damp/{name}"].attrs.update(attributes)
-
-    with hdf5.read(edit(replace)) as study:
-        np.testing.assert_array_equal(study["s01/damp"].v_th, CODES[0] * 0.5 + 1.0)
-        np.testing.assert_array_equal(study["s01/damp"].v_out, CODES[0] * 0.5 + 1.0)
 
 
 # what is wrong with a recording
@@ -443,11 +406,6 @@ def test_a_file_of_another_schema_is_refused_whole(change, message, edit):
     assert [str(problem) for problem in hdf5.check(path)] == [str(caught.value)]
 
 
-def test_a_newer_minor_version_is_read(edit):
-    with hdf5.read(edit(set_attribute("/", "schema_version", "1.9"))) as study:
-        assert len(study) == 5
-
-
 def test_files_that_are_none_are_refused(tmp_path):
     for name, content in (("text.h5", b"hello"), ("empty.h5", b"")):
         (tmp_path / name).write_bytes(content)
@@ -552,21 +510,6 @@ def test_trials_that_differ_in_samples_and_label_alone_are_stacked(shared, tmp_p
     study.close()
 
 
-def test_few_stacks_stay_open_however_many_are_read(tmp_path):
-    """HDF5 keeps megabytes of chunks for each open one."""
-    many = [
-        recording.replace(path=f"{stack}/{i}")
-        for stack in range(3 * scan.OPEN)
-        for i, recording in enumerate(trials(2, False))
-    ]
-    target = tmp_path / "many.h5"
-    Study.from_recordings(many).write(target)
-    with hdf5.read(target) as study:
-        assert contents(study) == contents(Study.from_recordings(many))
-        # The file itself, and what stays open in it.
-        assert h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_DATASET) <= scan.OPEN
-
-
 @pytest.mark.parametrize(
     "other",
     [
@@ -588,12 +531,6 @@ def test_trials_that_differ_in_more_are_not_stacked(other, tmp_path):
         assert "kind" not in file["s"].attrs
     with hdf5.read(tmp_path / "a.h5") as copy:
         assert contents(copy) == contents(study)
-
-
-def test_calibrations_are_never_stacked(tmp_path):
-    study = Study.from_recordings(trials(3, True, r_load=1e3, trial=""))
-    study.write(tmp_path / "a.h5")
-    assert hdf5.check(tmp_path / "a.h5") == []
 
 
 def test_labels_of_more_than_64_kilobytes_fit(tmp_path):
