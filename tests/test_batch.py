@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify import fitting, planning
-from etid.identify.fitting import skin_lane
-from etid.identify.options import Options
+from etid.identify import fitting
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 LENGTH = 10_000
-PULSE = 3334  # samples of one period, which output error fits
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 TRUTH = np.array([33.4e3, 186e3, 0.12e-9])
 SIGMAS = 5.0  # one in 2 million for a normal error, which the coverage test measures
@@ -57,10 +54,6 @@ def fits(study, driver):
     return etid.identify_skins(study.loaded, driver)
 
 
-def cut(recording, size=PULSE):
-    return recording.replace(v_th=recording.v_th[:size], v_out=recording.v_out[:size])
-
-
 def rows(fits, paths):
     order = fits.labels["path"].tolist()
     return fits.take(np.array([order.index(path) for path in paths]))
@@ -69,26 +62,6 @@ def rows(fits, paths):
 def assert_same(one, other):
     for a, b in zip(jax.tree.leaves(one.fit), jax.tree.leaves(other.fit), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize(
-    ("fewest", "most", "taken"), [(3, 64, [5, 5, 5, 3]), (3, 4, [4, 4, 4, 4, 2])]
-)
-def test_many_short_recordings_are_read_at_once_and_few_long_ones(
-    study, driver, monkeypatch, fewest, most, taken
-):
-    """Five recordings have as many samples as are inspected together."""
-    records = list(study.loaded.recordings())
-    size = records[0].samples["v_out"].stored.size
-    for name, value in (("FEWEST", fewest), ("MOST", most), ("TOGETHER", 5 * size)):
-        monkeypatch.setattr(planning, name, value)
-    rows = iter(range(MANY))
-    found = [
-        planning.prepared(lambda row: (records[row], driver), rows, Options())
-        for _ in planning.calls(MANY)
-    ]
-    assert [len(part) for part in found if part] == taken
-    assert [row for part in found for row, _ in part] == list(range(MANY))
 
 
 def test_more_than_a_chunk_keeps_the_order(study, fits):
@@ -116,28 +89,6 @@ def test_a_bad_recording_changes_no_bit_of_its_neighbours(study, driver, fits, b
     assert broken.verdicts[2] != "successful"
     others = np.arange(6) != 2
     assert_same(broken.take(others), rows(fits, np.array(paths)[others].tolist()))
-
-
-@pytest.mark.slow
-def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
-    traced = []
-
-    def counted(*arguments):
-        traced.append(arguments)
-        return skin_lane(*arguments)
-
-    monkeypatch.setattr(fitting, "skin_lane", counted)
-    records = [
-        cut(record, size)
-        for record, size in zip(study.loaded.recordings(), range(2900, PULSE, 13), strict=False)
-    ]
-    fits = etid.identify_skins(records, driver)
-    assert len({record.v_th.size for record in records}) == MANY
-    assert fits.fit.method == "output_error"
-    assert fits.counts() == {"successful": MANY}
-    error = np.asarray(fits.circuit.values()) - TRUTH
-    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
-    assert len(traced) <= 1  # none, if an earlier test has
 
 
 def test_one_function_per_length_serves_all_drivers(study, driver, monkeypatch):

@@ -1,6 +1,5 @@
 """The mathematics of the benchmarks: rates and intervals, what is silent, fronts, targets."""
 
-import csv
 import dataclasses
 from typing import Any
 
@@ -9,7 +8,6 @@ import pytest
 
 from benchmarks import (
     perturbations,
-    runner,
     speed_accuracy,
     which,
 )
@@ -42,39 +40,6 @@ def test_a_number_that_could_not_be_had_misses_its_target(capsys):
     for one in missed:
         assert not report([*met, one])
     assert capsys.readouterr().out.count("missed") == 2
-
-
-def test_tasks_that_were_done_at_this_commit_are_not_done_again(tmp_path, monkeypatch):
-    source = {"commit": "0123456789ab"}
-    monkeypatch.setattr(runner, "KEPT", tmp_path / "kept")
-    monkeypatch.setattr(runner, "provenance", lambda: source)
-    asked, path = [], tmp_path / "table.csv"
-
-    def square(number):
-        asked.append(number)
-        if number > 5:
-            raise KeyboardInterrupt
-        return number**2
-
-    def rows(done):
-        return [{"task": task, "square": found} for task, found in done.items()]
-
-    def done(*tasks):
-        return runner.tabled(path, rows, square, [(of,) for of in tasks], keep="squares")
-
-    with pytest.raises(KeyboardInterrupt):
-        done(3, 4, 6)
-    assert done(5, 4, 3) == [25, 16, 9]
-    assert asked == [3, 4, 6, 5]
-    with path.open() as file:
-        assert [row["square"] for row in csv.DictReader(file)] == ["25", "16", "9"]
-    source["commit"] = "another"
-    assert done(3) == [9]
-    assert asked == [3, 4, 6, 5, 3]
-    assert len([*runner.KEPT.iterdir()]) == 1
-    source["commit"] = "another+"  # the working tree is not that of the commit
-    assert done(3) == [9]
-    assert asked[-2:] == [3, 3]
 
 
 # --- answers --------------------------------------------------------------------------------------
@@ -144,12 +109,6 @@ def test_silent_answers_are_excused_up_to_what_the_best_test_would_miss(answers,
 
 
 # --- error against time ---------------------------------------------------------------------------
-
-
-def row(name, **of):
-    defaults = {"scene": "s", "mode": "batched", "beaten_by": "", "silent": 0.0, "error": 1.0}
-    more = {"ms": 1.0, "said": 0.0, "none": 0.0, "on_front": False, "missing": ""}
-    return {**defaults, **more, "estimator": name, **of}
 
 
 def test_the_readme_has_the_table_of_the_last_results():

@@ -66,10 +66,8 @@ def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_pat
         options = ("--snr-db", 50, "--jitter", 1e-7, "--seed", seed, "--force")
         options = (*options, "--truth", tmp_path / "t.json")
         assert run("simulate", "paper_dry", "-o", file, *options) == (
-            DONE,
-            [f"{file}: 11 recordings"],
-            [],
-        )
+            DONE, [f"{file}: 11 recordings"], [],
+        )  # fmt: skip
     records = []
     for file in files:
         with etid.read(file) as study:
@@ -102,15 +100,10 @@ def test_check_names_a_constant_current_and_remarks_on_an_implausible_one(run, t
     i = 1e-3 * np.sin(2 * np.pi * 60 * np.arange(10_000) / 200e3)
     records = {"right": i, "milli": 1e3 * i, "swapped": 5e4 * i, "constant": 0 * i + 1e-3}
     recordings = {
-        name: etid.Recording(
-            v_out=i if name == "swapped" else 5e4 * i,
-            current=current,
-            sample_rate=200e3,
-            pulse_rate=60.0,
-            path=name,
-        )
+        name: etid.Recording(v_out=i if name == "swapped" else 5e4 * i, current=current,
+                             sample_rate=200e3, pulse_rate=60.0, path=name)
         for name, current in records.items()
-    }
+    }  # fmt: skip
     constant = recordings.pop("constant")
     file = tmp_path / "remarks.h5"
     etid.Study.from_recordings(recordings.values()).write(file)
@@ -207,59 +200,41 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, without_d
     assert len(etid.Fits.read(target)) == 23
 
 
+OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
+
+
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("command", "words"),
     [
-        (("fit", "absent.h5", "-o", "fits.h5"), "absent.h5: there is no such file"),
-        (("fit", "garbage.h5", "-o", "fits.h5"), "garbage.h5: is not an HDF5 file"),
-        (
-            ("fit", "study.h5", "-o", "absent/fits.h5"),
-            "absent/fits.h5: the folder of this file does not exist",
-        ),
-        (("fit", "calibration.h5", "-o", "fits.h5"), "no loaded recording"),
-        (("import", "absent.csv", "-o", "out.h5"), "absent.csv: there is no such file"),
-        (("import", "table.csv", "-o", "out.h5"), "v_th: is not given"),
-        (("simulate", "paper_dry", "-o", "absent/s.h5"), "absent/s.h5: the folder of this file"),
-        (("simulate", "paper_dry", "-o", "s.h5", "--truth", "absent/t.json"), "absent/t.json: the"),
-        (("import", "table.csv", "-o", "absent/s.h5"), "absent/s.h5: the folder of this file"),
-        (("report", "fits.h5", "-o", "absent/page.html"), "absent/page.html: the folder of"),
-        (("export", "fits.h5", "-o", "absent/t.csv"), "absent/t.csv: the folder of this file"),
-        (("fit", "study.h5", "-o", "."), ".: this is a folder"),
-        (("fit", "study.h5", "-o", "table.csv"), "table.csv: the file is not written as .csv; "),
-        (("report", "fits.h5", "-o", "page.pdf"), "page.pdf: the file is not written as .pdf; "),
-        (("fit", "study.h5", "-o", "calibration.h5"), "this file exists; add --force to replace"),
-        (("report", "study.h5"), "run etid fit first"),
-        (("simulate", "paper_dry", "-o", "s.h5", "--jitter", "5"), "below half a pulse period"),
-        (
-            (
-                "import",
-                "table.csv",
-                "-o",
-                "s.h5",
-                "--v-th",
-                "open",
-                "--v-out",
-                "open",
-                "--scale",
-                "1",
-                "--pulse-rate",
-                "60",
-                "--sample-rate",
-                "2e5",
-            ),
-            "v_out: is channel 'open', and so is v_th",
-        ),
-        (("simulate", "paper_dry", "-o", "s.h5", "--jitter", "-1"), "must not be negative"),
+        ("fit absent.h5 -o fits.h5", "absent.h5: there is no such file"),
+        ("fit garbage.h5 -o fits.h5", "garbage.h5: is not an HDF5 file"),
+        ("fit calibration.h5 -o fits.h5", "no loaded recording"),
+        ("import absent.csv -o out.h5", "absent.csv: there is no such file"),
+        ("import table.csv -o out.h5", "v_th: is not given"),
+        (f"import table.csv -o s.h5 {OPEN}", "v_out: is channel 'open', and so is v_th"),
+        ("fit study.h5 -o absent/f.h5", "absent/f.h5: the folder of this file does not exist"),
+        ("simulate paper_dry -o absent/s.h5", "absent/s.h5: the folder of this file"),
+        ("simulate paper_dry -o s.h5 --truth absent/t.json", "absent/t.json: the folder"),
+        ("import table.csv -o absent/s.h5", "absent/s.h5: the folder of this file"),
+        ("report fits.h5 -o absent/page.html", "absent/page.html: the folder of"),
+        ("export fits.h5 -o absent/t.csv", "absent/t.csv: the folder of this file"),
+        ("fit study.h5 -o .", ".: this is a folder"),
+        ("fit study.h5 -o table.csv", "table.csv: the file is not written as .csv; "),
+        ("report fits.h5 -o page.pdf", "page.pdf: the file is not written as .pdf; "),
+        ("fit study.h5 -o calibration.h5", "this file exists; add --force to replace"),
+        ("report study.h5", "run etid fit first"),
+        ("simulate paper_dry -o s.h5 --jitter 5", "below half a pulse period"),
+        ("simulate paper_dry -o s.h5 --jitter -1", "must not be negative"),
     ],
 )
 def test_an_error_is_one_line_without_a_traceback(
-    run, study_file, tmp_path, monkeypatch, arguments, words
+    run, study_file, tmp_path, monkeypatch, command, words
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "garbage.h5").write_bytes(b"no HDF5")
     (tmp_path / "table.csv").write_text("open,skin\n1,2\n")
     etid.scenes.paper_calibration().simulate(seed=0).write(tmp_path / "calibration.h5")
-    status, printed, complaints = run(*arguments)
+    status, printed, complaints = run(*command.split())
     assert (status, printed, len(complaints)) == (WRONG_DATA, [], 1)
     assert complaints[0].startswith("etid: error: ")
     assert words in complaints[0]
@@ -335,13 +310,8 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(run, stud
         written = {"check": "file", "report": "page"}.get(command, "target")
         assert set(found) >= {"command", "status", written}
         inner = [item for value in found.values() if isinstance(value, list) for item in value]
-        keys = {
-            key
-            for item in inner
-            if isinstance(item, dict) and "subject" not in item
-            for key in item
-        }
-        assert keys <= told, command
+        groups = [item for item in inner if isinstance(item, dict) and "subject" not in item]
+        assert {key for item in groups for key in item} <= told, command
 
 
 def test_json_of_an_error_is_on_stdout_and_its_line_on_stderr(run):
@@ -381,18 +351,13 @@ assert not {{"jax", "equinox", "h5py"}} & set(sys.modules)
 
 @pytest.mark.parametrize(
     "arguments",
-    [(), ("nonsense",), ("fit", "study.h5"), ("simulate", "nonsense", "-o", "x.h5"),
-     ("fit", "a.h5", "-o", "b.h5", "--method", "guessing"), ("--completion", "sh"),
-     ("fit", "a.h5", "-o", "b.h5", "--workers", "0"),
-     ("fit", "a.h5", "-o", "b.h5", "--workers", "-1"),
-     ("fit", "a.h5", "-o", "b.h5", "--order", "50"),
-     ("fit", "a.h5", "-o", "b.h5", "--order", "1"),
-     ("fit", "a.h5", "-o", "b.h5", "--plausible", "300"),
-     ("fit", "a.h5", "-o", "b.h5", "--order", "many"),
-     ("fit", "--json")],
+    ["", "nonsense", "fit study.h5", "simulate nonsense -o x.h5", "--completion sh", "fit --json"]
+    + [f"fit a.h5 -o b.h5 {option}" for option in (
+        "--method guessing", "--workers 0", "--workers -1", "--order 50", "--order 1",
+        "--order many", "--plausible 300")],
 )  # fmt: skip
 def test_wrong_usage_ends_with_2(run, arguments):
-    status, printed, complaints = run(*arguments)
+    status, printed, complaints = run(*arguments.split())
     assert (status, printed) == (WRONG_USAGE, [])
     assert complaints
 

@@ -112,14 +112,6 @@ def test_the_preamble_of_an_oscilloscope_is_compared_with_its_table(tmp_path):
     refused(scope(30, "1e-05"), "is 200000 Hz from the time 't', but 100000 Hz from the f", **told)
 
 
-def test_two_units_of_one_column_are_not_chosen_from(tmp_path):
-    path = table(tmp_path, "open [mV],skin [mV]\nmV,V\n" + "1,2\n3,4\n")
-    refused(path, "the file says 'mV' and 'V' of channel 'skin'", **RATE)
-    path = table(tmp_path, "open [mV],skin (V)\n(millivolts),\n" + "1,2\n3,4\n")
-    one, _ = imported(path, **RATE)  # two spellings of one unit
-    np.testing.assert_allclose(one.v_th, [1e-3, 3e-3])
-
-
 # Other formats
 
 

@@ -9,7 +9,6 @@ import pytest
 
 import etid
 from etid import cli
-from etid.identify import file as fit_file
 from etid.plotting import figure_of
 from etid.recordings.causes import why_misaligned
 from etid.recordings.preflight import Inspected, preflight
@@ -189,28 +188,6 @@ def test_draws_of_a_fit_with_known_elements_keep_to_them(skin):
         fit.profile("r_s")
 
 
-def test_a_run_with_other_known_elements_is_not_resumed(skin, tmp_path, monkeypatch):
-    source, target = tmp_path / "study.h5", tmp_path / "fits.h5"
-    etid.Study.from_recordings([skin.replace(path="s01/0")]).write(source)
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(fit_file, "_fit", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            etid.fit_file(source, target, **KNOWN)
-    with pytest.raises(fit_file.ResumeError, match="another fixed"):
-        etid.fit_file(source, target, fixed={"r_s": 34e3}, prior=KNOWN["prior"], resume=True)
-    with pytest.raises(fit_file.ResumeError, match="another prior"):
-        etid.fit_file(source, target, fixed=KNOWN["fixed"], resume=True)
-    found = etid.fit_file(source, target, **KNOWN, resume=True)
-    settings = etid.StudyFits.read(target).settings
-    assert settings is not None
-    assert (found.settings, settings.fixed) == (settings, ("r_s 33000.0",))
-    assert settings.prior == ("c_p 1.2e-10 ± 1e-13",)
-
-
 def test_known_elements_on_the_command_line(skin, tmp_path, capsys):
     study = tmp_path / "study.h5"
     etid.Study.from_recordings([skin.replace(path="s01/0")]).write(study)
@@ -233,13 +210,6 @@ def test_known_elements_on_the_command_line(skin, tmp_path, capsys):
     with pytest.raises(SystemExit):
         cli.main([*command, "--prior", "r_s=much"])
     assert "write --fix r_s=500 or --prior r_s=500,50" in capsys.readouterr().err
-
-
-def test_without_a_driver_the_unloaded_voltage_is_not_used(skin):
-    both = skin.replace(v_th=np.zeros_like(skin.v_out))
-    np.testing.assert_array_equal(
-        etid.identify_skin(both).circuit.values(), etid.identify_skin(skin).circuit.values()
-    )
 
 
 @pytest.mark.parametrize(

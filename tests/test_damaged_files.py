@@ -191,11 +191,7 @@ def replaced(fits, name, values):
     ("name", "values", "message"),
     [
         ("chi2", None, "chi2: the column is missing"),
-        ("chi2", np.zeros(5), "chi2: has 5 rows, path has 6"),
-        ("chi2", np.zeros((6, 2)), r"chi2: has shape \(6, 2\), must be \(fit\)"),
-        ("chi2", ["x"] * 6, "chi2: is text, must be number"),
         ("steps", np.zeros(6), "steps: is of type float64, must be integer"),
-        ("path", np.zeros(6), "path: is of type float64, must be text"),
         ("cov", np.zeros((6, 2, 2)), "cov: has shape"),
         ("verdict", ["fine"] * 6, "verdict: 'fine' is not a verdict"),
         ("drivers", ["{"], r"drivers\[0\]: holds a driver that cannot be read"),
@@ -214,8 +210,6 @@ def test_a_wrong_column_is_one_error_that_names_file_column_and_remedy(fits, nam
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("circuit", 3, "circuit: is 3, must be text"),
-        ("method", None, "method: is missing"),
         ("order", "five", "order: is 'five', must be"),
         ("start", "x", "start: is 'x', must be"),
     ],

@@ -226,23 +226,6 @@ def test_a_pulse_is_suspected_by_the_distance_from_its_prediction(limit):
 # --- changes --------------------------------------------------------------------------------------
 
 
-def test_an_innovation_and_its_moving_mean_are_those_of_their_formulas():
-    d, direction = np.array([0.3, -0.2]), np.array([1.0, -2.0])
-    spread = np.linalg.inv(TOLD)
-    new = alarms.Innovation.of(*map(jnp.asarray, (d, spread, BEFORE)))
-    cov = spread + np.linalg.inv(BEFORE)
-    weight = np.linalg.inv(cov)
-    np.testing.assert_allclose(new.cov, cov)
-    np.testing.assert_allclose(new.statistic(), d @ weight @ d)
-    along = direction @ weight @ d / np.sqrt(direction @ weight @ direction)
-    np.testing.assert_allclose(new.along(jnp.asarray(direction)), along)
-    mean = np.array([0.1, 0.4])
-    moving = alarms.averaged(jnp.asarray(mean), jnp.asarray(BEFORE / 1e4), new)
-    np.testing.assert_allclose(moving.d, 0.9 * mean + 0.1 * d)
-    np.testing.assert_allclose(moving.cov, 0.81 * BEFORE / 1e4 + 0.01 * cov)
-    np.testing.assert_allclose(moving.weight, np.linalg.inv(moving.cov))
-
-
 LANES = 20
 SURE = alarms.DRIVER * 1.709 / np.sqrt(LANES) - 1.282  # nine tenths of z beyond it: the driver
 
