@@ -4,8 +4,6 @@ The truth is a differential equation of the skin under a current source, solved 
 in time; harmonic balance and fits know nothing of it.
 """
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,15 +14,10 @@ from scipy.special import erf
 import etid
 from benchmarks import amplitudes as amplitudes_benchmark
 from etid.circuits.current_dependent import Norton, Signals, port
-from etid.estimators.amplitudes.terms import Amplitudes
-from etid.estimators.lanes import Harmonics, stacked
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.amplitudes import leaves_much
-from etid.identify.fitting import known_of
 from etid.numpy_tier import tiers
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
-from etid.results.feed import MEASURED_CURRENT
 from etid.signals.transfer import frequency_variable
 from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
 
@@ -120,18 +113,6 @@ def test_a_large_i_0_is_a_linear_load():
     peak = np.abs(np.asarray(linear)).max()
     np.testing.assert_allclose(signals.voltage, linear, atol=1e-7 * peak)
     np.testing.assert_allclose(signals.current * z, linear, atol=1e-7 * peak)
-
-
-def test_harmonics_that_are_not_fitted_act_on_the_skin():
-    """Aliases or hum keep them from the fit; zeros in their place would be another stimulus."""
-    lane = Harmonics.of(Inspected(recording(1e-3, 0)))
-    known = known_of(lane, MEASURED_CURRENT, False, MAXIMUM_LIKELIHOOD)
-    rate = jnp.array(SAMPLE_RATE)
-    of = Amplitudes(known, MEASURED_CURRENT, SKIN, stacked([lane]).spectrum, rate)
-    (own,) = of.own(of.start(SKIN.log_values()))
-    few = dataclasses.replace(lane.spectrum, selected=lane.spectrum.frequency > 400.0)
-    all_fitted, few_fitted = (of.loaded(own, one) for one in (lane.spectrum, few))
-    np.testing.assert_array_equal(few_fitted, all_fitted)
 
 
 def test_what_cannot_be_fitted_is_refused_at_once():

@@ -6,15 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import (
-    perturbations,
-    speed_accuracy,
-    which,
-)
+from benchmarks import perturbations, speed_accuracy, which
 from benchmarks.estimators import NOTHING, Answer
 from benchmarks.machine import RESULTS
 from benchmarks.rates import clopper_pearson, rate
-from benchmarks.runner import Target, report
+from benchmarks.runner import report
 
 # --- rates ----------------------------------------------------------------------------------------
 
@@ -31,15 +27,6 @@ def test_trials_behind_one_driver_are_not_independent(events, each, effective):
     found = rate(events, np.arange(len(events)) // each)
     assert found[:3] == pytest.approx((np.mean(events), *clopper_pearson(*effective)))
     assert found.trials == len(events)
-
-
-def test_a_number_that_could_not_be_had_misses_its_target(capsys):
-    met = Target("tick", 0.05, most=0.1), Target("hours", np.nan), Target("n", 3, 3, 3)
-    missed = Target("rival", np.nan, least=10.0), Target("tick", 0.2, most=0.1)
-    assert report(met)
-    for one in missed:
-        assert not report([*met, one])
-    assert capsys.readouterr().out.count("missed") == 2
 
 
 # --- answers --------------------------------------------------------------------------------------

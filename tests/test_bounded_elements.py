@@ -253,18 +253,3 @@ def test_bounds_in_time_and_at_several_amplitudes(noisy):
     )
     assert int(several.remarks) & Remark.at_bound
     assert several.circuit.r_s > lowest
-
-
-@pytest.mark.slow
-def test_intervals_of_bounded_fits_contain_the_truth():
-    """R_s known to a sixth, in the range of the paper; three deviations of 120 are 6 %."""
-    rng = np.random.default_rng(1)
-    truth = rng.uniform(19e3, 70e3, 120)
-    recordings = [
-        recorded(etid.SkinRC(r_s, 186e3, 0.12e-9), snr_db=14.0, seed=seed)
-        for seed, r_s in enumerate(truth)
-    ]
-    fits = etid.identify_skins(recordings, bounds={"r_s": (19e3, 70e3)})
-    covered = np.abs(np.asarray(fits.circuit.r_s) - truth) < 1.96 * np.asarray(fits.stderr.r_s)
-    assert covered.mean() > 0.89
-    assert (fits.verdicts == "successful").mean() > 0.98

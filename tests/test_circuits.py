@@ -15,7 +15,6 @@ from etid import (
     cole,
     constant_phase,
     parallel,
-    parameter,
     resistor,
     series,
 )
@@ -99,14 +98,3 @@ def test_an_exponent_is_too_steep_if_its_error_does_not_explain_it():
         found = SkinCole().with_log_values(SkinCole(20e3, 100e3, 30e-6, alpha).log_values())
         assert bool(found.is_too_steep(cov)) == expected
     assert not bool(SkinRC().is_too_steep(jnp.eye(3)))
-
-
-def test_a_connection_of_nothing_is_refused():
-    for connect in (series, parallel):
-        with pytest.raises(ValueError, match="has no arguments"):
-            connect()
-
-
-def test_unknown_units_are_refused():
-    with pytest.raises(ValueError, match="'tesla' is not known"):
-        parameter("tesla", typical=1.0)

@@ -117,20 +117,13 @@ def off(fit, name):
     return (values - np.asarray(SKINS[name].values())) / errors
 
 
-def test_the_default_is_maximum_likelihood_and_right():
-    """It was output error, whose errors did not know of the aliases."""
-    fits = etid.identify_study(study(True)).fits
-    for fit, name in each(fits):
+@pytest.mark.parametrize(
+    "identify", [etid.identify_study, pytest.param(etid.identify_jointly, marks=pytest.mark.slow)]
+)
+def test_a_fit_is_by_maximum_likelihood_and_right(identify):
+    for fit, name in each(identify(study(True)).fits):
         assert fit.verdict == "successful"
-        assert fit.method == "maximum_likelihood"
-        assert np.abs(off(fit, name)).max() < SIGMAS
-
-
-def test_a_joint_fit_takes_such_records():
-    """It refused them: they 'do not hold several whole pulse periods'."""
-    fits = etid.identify_jointly(study(True)).fits
-    for fit, name in each(fits):
-        assert fit.verdict == "successful", fit
+        assert fit.method in ("maximum_likelihood", "joint")
         assert np.abs(off(fit, name)).max() < SIGMAS
 
 
@@ -199,20 +192,17 @@ def test_a_spectrum_that_falls_with_a_power_has_the_aliases_of_this_power():
     np.testing.assert_allclose(of.power[:1400], (1 - u[:1400]) ** -14.0, rtol=0.15)
 
 
-def drawn(number, snr_db, method=None, **settings):
-    """Errors of skins behind drawn drivers in standard errors; skins that are not fitted.
-
-    The signal-to-noise ratios take turns.
-    """
+def drawn(**settings):
+    """Errors of skins behind drawn drivers in standard errors; skins that are not fitted."""
     errors, others = [], []
-    for draw in range(number):
-        bench = Bench(100 + draw, snr_db=snr_db[draw % len(snr_db)], **settings)
+    for draw in range(18):
+        bench = Bench(100 + draw, snr_db=(40.0, 60.0, 80.0)[draw % 3], **settings)
         try:
             driver = etid.identify_driver(bench.calibration())
         except etid.IdentificationError as error:
             others += [str(error).split(": ")[1].split(".")[0].split(",")[0]] * len(SKINS)
             continue
-        fits = etid.identify_skins([bench.loaded(name) for name in SKINS], driver, method=method)
+        fits = etid.identify_skins([bench.loaded(name) for name in SKINS], driver)
         for fit, name in each(fits):
             if fit.verdict == "successful":
                 errors.append(off(fit, name))
@@ -221,15 +211,12 @@ def drawn(number, snr_db, method=None, **settings):
     return np.array(errors), others
 
 
-LEVELS = (40.0, 60.0, 80.0)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "pulses", "periods"), [(200e3, 50.0, 10), (240e3, 60.0, 3)], ids=["50 Hz", "60 Hz"]
 )
 def test_behind_a_filter_the_elements_are_within_their_errors(rate, pulses, periods):
-    errors, others = drawn(18, LEVELS, rate=rate, pulses=pulses, periods=periods)
+    errors, others = drawn(rate=rate, pulses=pulses, periods=periods)
     assert len(others) <= 2
     assert np.abs(errors).max() < SIGMAS
     assert np.sqrt(np.mean(errors**2, axis=0)).max() < 1.3  # 1 ± 0.09 without any aliases
@@ -238,6 +225,6 @@ def test_behind_a_filter_the_elements_are_within_their_errors(rate, pulses, peri
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate", "pulses"), [(200e3, 50.0), (240e3, 60.0)], ids=["50 Hz", "60 Hz"])
 def test_without_a_filter_no_fit_is_silently_wrong(rate, pulses):
-    errors, others = drawn(18, LEVELS, rate=rate, pulses=pulses, filtered=False)
+    errors, others = drawn(rate=rate, pulses=pulses, filtered=False)
     assert others.count("biased") >= 0.75 * 36
     assert not errors.size or np.abs(errors).max() < SIGMAS

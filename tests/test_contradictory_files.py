@@ -187,20 +187,3 @@ def test_a_scaling_that_leaves_no_samples_is_refused(kind, tmp_path):
         refused(path, "v_out: channel 'rig/skin' is scaled with slope", **RIG)
     one, _ = imported(rig(tmp_path, V_TH, codes, **LINE), **RIG)
     np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * np.arange(COUNT), rtol=1e-15)
-
-
-def test_two_units_of_a_tdms_channel_are_not_chosen_from(tmp_path):
-    said = "v_out: the file says 'V' and 'mV' of channel 'rig/skin'"
-    refused(rig(tmp_path, V_TH, V_OUT, NI_UnitDescription="mV"), said, **RIG)
-    one, _ = imported(rig(tmp_path, V_TH, V_OUT, NI_UnitDescription="Volts"), **RIG)
-    np.testing.assert_array_equal(one.v_out, V_OUT)
-
-
-def test_the_steps_of_a_tdms_channel_have_a_unit(tmp_path):
-    refused(
-        rig(tmp_path, V_TH, V_OUT, wf_xunit_string="Hz"),
-        "a sample every 5e-06 'Hz', which is not a",
-        **RIG,
-    )
-    path = rig(tmp_path, V_TH, V_OUT, wf_increment=5.0, wf_xunit_string="us")
-    assert imported(path, **RIG)[0].sample_rate == pytest.approx(200e3, rel=1e-12)

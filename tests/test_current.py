@@ -9,7 +9,6 @@ import pytest
 
 import etid
 from etid import cli
-from etid.plotting import figure_of
 from etid.recordings.causes import why_misaligned
 from etid.recordings.preflight import Inspected, preflight
 from tests import kept_numbers
@@ -61,15 +60,6 @@ def test_a_load_is_identified_from_whole_periods_of_current_and_voltage(skin):
     assert np.abs(off(fit, SKIN)).max() < WITHIN
     assert fit.stderr.r_p < 1e-3 * fit.circuit.r_p
     kept_numbers.check("current", kept_numbers.of_fit(fit))
-
-
-@pytest.mark.slow
-def test_a_constant_phase_is_identified_and_chosen():
-    recording = recorded(COLE)
-    selection = etid.select_circuit(recording)
-    assert all(axes.has_data() for axes in figure_of(selection, recording).axes)
-    assert type(selection.fit.circuit) is etid.SkinCole
-    assert np.abs(off(selection.fit, COLE)).max() < WITHIN
 
 
 @pytest.mark.slow

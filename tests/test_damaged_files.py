@@ -209,10 +209,7 @@ def test_a_wrong_column_is_one_error_that_names_file_column_and_remedy(fits, nam
 
 @pytest.mark.parametrize(
     ("name", "value", "message"),
-    [
-        ("order", "five", "order: is 'five', must be"),
-        ("start", "x", "start: is 'x', must be"),
-    ],
+    [("order", "five", "order: is 'five', must be"), ("start", "x", "start: is 'x', must be")],
 )
 def test_a_wrong_attribute_is_one_error_that_names_it(fits, name, value, message):
     with h5py.File(fits, "r+") as file:
@@ -223,19 +220,16 @@ def test_a_wrong_attribute_is_one_error_that_names_it(fits, name, value, message
         StudyFits.read(fits)
 
 
-@pytest.mark.parametrize("rows", [1, 6])
-def test_a_column_whose_texts_are_said_to_be_long_is_refused_before_it_is_read(fits, rows):
+def test_a_column_whose_texts_are_said_to_be_long_is_refused_before_it_is_read(fits):
     with h5py.File(fits) as file:
         start = file["path"].id.get_offset()
     data = bytearray(fits.read_bytes())
-    for row in range(rows):  # each is shorter than the file, all of them are not
+    for row in range(6):  # each is shorter than the file, all of them are not
         at = start + 16 * row
-        length = 2**31 - 1 if rows == 1 else len(data) // 3
-        data[at : at + 4] = length.to_bytes(4, "little")
+        data[at : at + 4] = (len(data) // 3).to_bytes(4, "little")
     fits.write_bytes(data)
-    with pytest.raises(etid.RecordingError, match="path: declares texts of") as caught:
+    with pytest.raises(etid.RecordingError, match="path: declares texts of"):
         StudyFits.read(fits)
-    assert caught.value.remedy
 
 
 # Files of other formats

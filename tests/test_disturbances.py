@@ -120,15 +120,6 @@ def test_skin_that_changes_is_no_disturbance(name):
             assert Inspected(recorded(scene, loads)).kept is None
 
 
-def test_what_leaves_no_majority_of_equal_periods_is_not_left_out():
-    recording = rung("dry").simulate(1)[TRIAL]
-    assert Inspected(with_spike(with_spike(recording, 0), 1, -0.2)).kept is None
-    four = rung("dry", samples=13_333).simulate(1)[TRIAL]
-    assert Inspected(with_spike(with_spike(four, 0), 1, -0.2)).kept is None
-    two = rung("dry", samples=6_667).simulate(1)[TRIAL]
-    assert Inspected(with_spike(two, 1)).kept is None
-
-
 def test_another_pulse_of_the_source_is_no_disturbance():
     """Both records show it, and the ratio of their harmonics is as without it."""
     recording = rung("damp").simulate(1)[TRIAL]

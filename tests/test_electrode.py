@@ -1,6 +1,5 @@
 """The state of one electrode after a pulse, against the same rules written for one electrode."""
 
-import dataclasses
 import itertools
 from typing import Any, NamedTuple
 
@@ -10,21 +9,11 @@ import numpy as np
 import pytest
 
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
-from etid.online import alarms, tick
-from etid.online import state as states
+from etid.online import alarms
 from etid.online.alarms import GainScore
-from etid.online.gain_bands import Bands
-from etid.online.projection import Seen
-from etid.online.state import DRIFT, JUMP, NONE, ElectrodeState, TrackerState
-from etid.online.tick import (
-    PATIENCE,
-    Attempt,
-    Measured,
-    Suspicion,
-    after_pulse,
-    suspicion,
-)
-from etid.results.verdicts import RESULTS, verdict_names, verdicts_of
+from etid.online.state import DRIFT, JUMP, NONE, ElectrodeState
+from etid.online.tick import PATIENCE, Attempt, Measured, Suspicion, after_pulse
+from etid.results.verdicts import RESULTS, verdict_names
 
 NUMBER, LIMIT = 77, 10.0
 POWERS = np.array([1.0, -1.0])  # of a resistor and of a capacitor
@@ -199,30 +188,6 @@ def test_the_state_after_a_pulse_follows_its_rules_in_every_case():
     assert not wrong, (len(wrong), wrong[:3])
 
 
-@pytest.mark.parametrize("limit", [0.5, 2.0])
-def test_a_pulse_is_suspected_by_the_distance_from_its_prediction(limit):
-    """T = δᵀ (Λ⁻¹ + cov)⁻¹ δ of the fit of the pulse alone, δ = δ₊ + cov Λ δ₊."""
-    of = Case(True, True, True, True, "good", False, 0, False, False, False)
-    state, _, before, found, *_ = electrode(of)
-    off = (found.own - state["own"])[:2]
-    alone = off + found.spread @ before @ off
-    statistic = alone @ np.linalg.inv(np.linalg.inv(before) + found.spread) @ alone
-
-    def suspected(running, good, part):
-        pulses = {"pulses": 12 if running else 0}
-        of = ElectrodeState(**jax.tree.map(jnp.asarray, state | pulses))
-        fit = found._replace(result=GOOD if good else BAD)
-        fit = jax.tree.map(jnp.asarray, fit)
-        arguments = jnp.asarray(before), jnp.array([0.6, 0.8]), jnp.asarray(part * statistic)
-        return jax.jit(suspicion)(of, fit, *arguments)
-
-    assert bool(suspected(True, True, limit).jump) == (limit < 1)
-    assert bool(suspected(True, False, limit).jump)
-    assert not bool(suspected(True, False, limit).drift)
-    assert not bool(suspected(False, True, limit).jump)
-    assert not bool(suspected(False, False, limit).drift)
-
-
 # --- changes --------------------------------------------------------------------------------------
 
 
@@ -263,110 +228,4 @@ def test_the_driver_has_changed_if_most_electrodes_move_one_way(z, jumps, counte
     assert bool(found) == expected
 
 
-def state_of(**fields: Any) -> TrackerState:
-    """A state after pulse 100 of as many electrodes as a field has."""
-    count = max(len(value) for value in fields.values())
-    one = electrode(Case(True, False, False, True, "good", False, 0, False, False, False))[0]
-    lanes: dict[str, Any] = {
-        name: jnp.asarray(np.stack([value] * count))
-        for name, value in one.items()
-        if name != "result"
-    }
-    verdicts = fields.pop("verdicts", ["successful"] * count)
-    lanes["result"] = jax.tree.map(jnp.asarray, verdicts_of(np.array(verdicts)))
-    lanes |= {name: jnp.asarray(value) for name, value in fields.items()}
-    no = jnp.asarray(False)
-    return TrackerState(ElectrodeState(**lanes), jnp.asarray(100), no, no)
-
-
-def test_an_electrode_that_cannot_be_used_has_the_first_reason_that_applies():
-    last = 100 - states.RECENT
-    cases = [  # level, impedance, pulses, drifted, verdict, reason
-        (0.5, 1e3, 9, -1, "successful", None),
-        (0.5, 1e3, 9, -1, "unconnected", "open"),
-        (0.0199, 1e3, 9, -1, "unconnected", "open"),
-        (0.0199, 1e3, 0, -1, "flat", "shorted"),
-        (0.0201, 1e3, 0, -1, "flat", None),
-        (0.5, 701e3, 1, -1, "misfit", "dry"),
-        (0.5, 699e3, 1, -1, "misfit", None),
-        (0.5, 701e3, 0, -1, "misfit", None),
-        (0.5, 1e3, 9, last, "successful", None),
-        (0.5, 1e3, 9, last + 1, "successful", "drifting"),
-        (0.5, 701e3, 9, 100, "successful", "dry"),
-    ]
-    level, impedance, pulses, drifted, verdicts, reasons = map(list, zip(*cases, strict=True))
-    state = state_of(
-        level=np.array(level), pulses=np.array(pulses), drifted=np.array(drifted), verdicts=verdicts
-    )
-    found = states.bad_electrodes(state, np.array(impedance))
-    assert found == {number: why for number, why in enumerate(reasons) if why}
-    early = dataclasses.replace(state, number=jnp.asarray(5))  # none has drifted yet
-    early = states.bad_electrodes(
-        dataclasses.replace(
-            early,
-            electrodes=state_of(drifted=np.array([-1, 0]), pulses=np.array([1, 1])).electrodes,
-        ),
-        np.array([1e3, 1e3]),
-    )
-    assert early == {1: "drifting"}
-
-
 # --- what a pulse shows ---------------------------------------------------------------------------
-
-
-def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch):
-    """Level, offset and amplitude, and the first verdict that applies, from the measured gains."""
-    weight = np.array([3.0, 2.0, 0.0])
-    rows = [  # amplitude, amplitude before, mean, gain, variance, clipped, offset before, verdict
-        (1.0, 1.0, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
-        (2.0, 1.0, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
-        (2.0, np.nan, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
-        (1.0, 0.905, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
-        (1.0, 0.895, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
-        (1.0, 1.0, 0.1, 0.5, np.nan, True, 0.2, "nonfinite_samples"),
-        (1.0, 1.0, np.nan, 0.5, 1e-3, True, 0.2, "nonfinite_samples"),
-        (1.0, 2.0, 0.1, 0.5, 1e-3, True, np.nan, "saturated"),
-        (1.0, 2.0, 0.1, 1e-3, 1e-1, False, np.nan, "too_short"),
-        (1.0, 1.0, 0.1, 1e-3, 1e-1, False, 0.2, "flat"),
-        (0.0, 1.0, 0.1, 0.995, 1e-3, False, 0.2, "flat"),
-        (1.0, 1.0, 0.1, 0.9902, 1e-6, False, 0.2, "unconnected"),
-        (1.0, 1.0, 0.1, 0.9898, 1e-6, False, 0.2, "successful"),
-        (1.0, 1.0, 0.1, 1.0098, 1e-6, False, 0.2, "unconnected"),
-        (1.0, 1.0, 0.1, 1.0102, 1e-6, False, 0.2, "successful"),
-        (4.0, 4.0, 0.1, 4 * 0.9902, 1e-6, False, 0.2, "unconnected"),
-        (1.0, 1.0, 0.1, np.sqrt(3.99e-2 * 4 / 5), 1e-2, False, 0.2, "flat"),
-        (1.0, 1.0, 0.1, np.sqrt(4.01e-2 * 4 / 5), 1e-2, False, 0.2, "successful"),
-    ]
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    amplitude, before, mean, gain, variance, clipped, offset, verdict = columns
-    used = []
-
-    def measure(self, seen, lacking, offset):
-        used.append((np.asarray(lacking), np.asarray(offset)))
-        wide = jnp.asarray(gain[:, None] * np.exp(1j * np.arange(3))[None, :])
-        return wide, jnp.ones((len(rows), 3))
-
-    monkeypatch.setattr(Bands, "measure", measure)
-    bands = object.__new__(Bands)  # only its weights are read
-    object.__setattr__(bands, "weight", jnp.asarray(weight))
-    zero = np.zeros(len(rows))
-    sums = np.stack([*np.zeros((6, len(rows))), mean, zero, zero], axis=1)
-    seen = Seen(sums, variance, clipped)
-    state = state_of(amplitude=before, offset=offset).electrodes
-    found = tick.measured_pulse(bands, seen, jnp.asarray(amplitude), state)
-    relative = np.where(amplitude > 0, amplitude, 1.0)
-    lacking = np.where(np.isnan(before), 0.0, (relative - before) / relative)
-    steady = abs(lacking) < tick.STEADY
-    known = np.where(np.isfinite(mean) & np.isfinite(variance) & steady, mean, offset)
-    np.testing.assert_allclose(used[0][0], lacking)
-    np.testing.assert_allclose(used[0][1], np.where(np.isnan(known), 0.0, known))
-    np.testing.assert_array_equal(found.steady, steady)
-    np.testing.assert_array_equal(found.offset, known)
-    np.testing.assert_array_equal(found.amplitude, amplitude)
-    np.testing.assert_allclose(found.variance, variance / relative**2)
-    np.testing.assert_allclose(found.weight, np.repeat(relative[:, None] ** 2, 3, axis=1))
-    np.testing.assert_allclose(abs(np.asarray(found.gain))[:, 0], gain / relative)
-    # Two bands tell something, each by two numbers.
-    power = np.maximum(gain**2 * weight.sum() - 4 * variance, 0.0) / weight.sum()
-    np.testing.assert_allclose(found.level, np.sqrt(power) / relative)
-    assert verdict_names(found.bad).tolist() == verdict.tolist()

@@ -205,13 +205,6 @@ def test_nwb_holds_what_was_stored_and_all_that_was_said(study_file, tmp_path):
             np.testing.assert_array_equal(row["r_load"], load)
 
 
-def test_records_whose_names_nwb_cannot_tell_apart_are_refused(study_file, tmp_path):
-    with h5py.File(study_file, "a") as file:
-        file.copy("s01/damp", "s01.damp")
-    with pytest.raises(etid.RecordingError, match=r"two records would be called 's01\.damp\.v_th'"):
-        etid.export_study(study_file, tmp_path / "study.nwb", session_start=START)
-
-
 def test_a_recording_that_cannot_be_read_is_not_left_out_silently(study_file, tmp_path):
     with h5py.File(study_file, "a") as file:
         del file["s01/damp/v_out"]
@@ -221,8 +214,7 @@ def test_a_recording_that_cannot_be_read_is_not_left_out_silently(study_file, tm
 
 
 @pytest.mark.parametrize(
-    ("package", "target", "extra"),
-    [("pyarrow", "t.parquet", "parquet"), ("pynwb", "t.nwb", "nwb")],
+    ("package", "target", "extra"), [("pyarrow", "t.parquet", "parquet"), ("pynwb", "t.nwb", "nwb")]
 )
 def test_a_missing_package_is_named_with_its_extra(
     package, target, extra, file, study_file, tmp_path, monkeypatch

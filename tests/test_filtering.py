@@ -110,27 +110,6 @@ def test_the_first_input_of_a_hold_is_a_zero_order_hold():
     np.testing.assert_allclose(found.B[:, :1], B, atol=1e-11 * np.abs(B).max())
 
 
-@pytest.mark.parametrize("sample_rate", [200e3, 2e6])
-@pytest.mark.parametrize("precision", [jnp.float64, jnp.float32])
-def test_rounding_stays_that_of_the_last_digits(sample_rate, precision):
-    """Driver and skin in blocks, against the same recursion with 64 bits of mantissa."""
-    system = held(SOURCE, SkinRC(33e3, 186e3, 0.12e-9).impedance().rational(), sample_rate)
-    v = np.zeros(4000)
-    v[200:1500] = 50.0
-    v += np.random.default_rng(3).normal(scale=0.05, size=v.size)
-    system = jax.tree.map(lambda leaf: leaf.astype(precision), system)
-    u = interpolate(jnp.asarray(v)).astype(precision)
-    A, B, C, D = (np.asarray(of, np.longdouble) for of in (system.A, system.B, system.C, system.D))
-    x, expected = np.zeros(C.size, np.longdouble), []
-    for now in np.asarray(u, np.longdouble):
-        expected.append(C @ x + D @ now)
-        x = A @ x + B @ now
-    y, _ = run(system, u, jnp.zeros(C.size, precision))
-    error = np.abs(np.asarray(y) - expected).max() / np.abs(expected).max()
-    # Sums of 40 products in a block; the states' own rounding decays with them.
-    assert error < 10 * np.finfo(precision).eps
-
-
 EXPONENTIAL = jax.jit(filtering._expm)  # operation by operation, it takes seconds
 
 

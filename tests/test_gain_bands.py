@@ -45,7 +45,6 @@ def bands_of(of):
 
 
 measured = jax.jit(Bands.measure)
-lacking_tail = jax.jit(Bands._lacking_tail)
 
 
 @pytest.mark.parametrize("bins", [40, 100, 333, 1000])
@@ -154,40 +153,3 @@ def test_what_a_window_lacks_of_the_tail_is_added_to_the_gain(exact):
     unsure = np.asarray(of.weight) * abs(0.2 * np.asarray(found - before)) ** 2 / 2
     expected = np.asarray(of.weight) / (np.asarray(seen.variance)[:, None] + unsure)
     np.testing.assert_allclose(weight, expected, rtol=1e-6)
-
-
-def test_the_tail_of_a_load_has_its_own_rate_as_far_as_noise_lets_it_be_seen(exact):
-    of, projection = exact
-    t, lacking = np.arange(SIZE), np.full(4, 0.5)
-    v_out = np.stack([np.exp(-1.01 * DECAY * t)] * 3 + [np.exp(-DECAY * t[::-1])])
-    last, middle = round(gain_bands.LAST * SIZE), SIZE // 2
-    early, late = v_out[:, middle : middle + last].mean(1), v_out[:, -last:].mean(1)
-    span = DECAY * (SIZE - last - middle)
-    # Noise by which the logarithm of the rate is as uncertain as loads make it.
-    equal = (0.2 * span) ** 2 * SIZE * last / (early[0] ** -2 + late[0] ** -2)
-    seen = projection.seen(v_out, UNLIMITED)
-    for found, mean in zip(seen.means(), (v_out.mean(1), early, late), strict=True):
-        np.testing.assert_allclose(found, mean, rtol=1e-6)
-    variance = np.array([0.0, equal, 1e9 * equal, 0.0])
-    sums = np.column_stack([seen.sums[:, :-2], early, late])
-    seen = seen._replace(sums=sums, variance=variance)
-    found = np.asarray(lacking_tail(of, seen, lacking, np.zeros(4)))
-    left = late / (1 - 0.5 * np.exp(-1.0))
-    shape, by_rate = np.asarray(of.tail)
-    for i, part in enumerate((0.01, 0.005, 0.0, 0.0)):
-        expected = 0.5 * left[i] * (shape + part * by_rate)
-        np.testing.assert_allclose(found[i], expected, atol=1e-6 * abs(expected).max())
-    # The second row of the tail is the derivative with respect to the logarithm of the rate.
-    later = np.arange(SIZE) + last / 2
-    x = np.asarray(of.x)
-
-    def projected(rate):
-        e = np.fft.rfft(np.exp(-rate * later))[1 : x.size + 1] * x.conj()
-        strengths = [(abs(x[k - 1]) ** 2).sum() for k in bands_of(of)]
-        return np.array([e[k - 1].sum() for k in bands_of(of)]) / strengths
-
-    np.testing.assert_allclose(shape, projected(DECAY), atol=1e-6 * abs(shape).max())
-    step = 1e-4
-    slope = (projected(DECAY * (1 + step)) - projected(DECAY * (1 - step))) / (2 * step)
-    np.testing.assert_allclose(by_rate, slope, atol=1e-6 * abs(slope).max())
-    assert of.tail_left == pytest.approx(np.exp(-1.0), rel=1e-6)

@@ -8,8 +8,6 @@ from jax.flatten_util import ravel_pytree
 
 import etid
 from etid.estimators.estimate import DELAY_WIDTH, prior
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.signals.harmonics import spectrum
 from etid.signals.noise import noise
 from etid.simulation.scenes import Scene, Trial
@@ -67,22 +65,3 @@ def test_the_covariance_of_a_driver_is_the_inverse_of_its_information(driver):
     ratio = np.diagonal(driver.cov) / np.diagonal(expected)[:-1]
     assert (ratio > 0.8).all(), ratio
     assert (ratio < 1.5).all(), ratio
-
-
-@pytest.mark.slow
-def test_what_a_calibration_tells_is_one_standard_deviation_along_each_direction(driver):
-    """z is scaled by the information, so that its covariance is 1, and its mean next to 0."""
-    frequency = driver.spectra.frequency[0]
-    known = MAXIMUM_LIKELIHOOD.known(driver, frequency, False)
-    assert isinstance(known, GivenDriver)
-    of = np.linalg.eigvalsh(np.asarray(known.cov))
-    assert of.min() > 0.8, of
-    assert of.max() < 1.6, of
-    # A part of a standard deviation along the floor of the valley that one resistor leaves.
-    assert (np.abs(np.asarray(known.mean)) < 0.3).all()
-    # W is log (Z_th + R), from which Z_th comes back.
-    z = np.asarray(driver.response(frequency))
-    still = known.z_th(jnp.zeros(frequency.size, complex))
-    np.testing.assert_allclose(still, z, rtol=1e-9)
-    moved = known.z_th(jnp.full(frequency.size, 0.1 + 0.05j))
-    np.testing.assert_allclose(moved, (z + R_LOAD) * np.exp(0.1 + 0.05j) - R_LOAD, rtol=1e-6)

@@ -154,6 +154,11 @@ def make_external_storage(file):
     file[DAMP].create_dataset("v_out", (4,), "i2", external=where).attrs["unit"] = "volt"
 
 
+def misspell_offset(file):
+    attributes = file[f"{DAMP}/v_th"].attrs
+    attributes["ofset"] = attributes.pop("offset")
+
+
 def make_sequence(file):
     dtype = h5py.vlen_dtype(np.dtype("i4"))
     data = np.empty(1, dtype)
@@ -183,7 +188,7 @@ PROBLEMS = [
     (attribute(f"{DAMP}/v_th", "offset", np.inf), "v_th.offset: is inf"),
     (lambda file: file[DAMP].attrs.update(calibration=file["s01"].ref), "is an HDF5 reference"),
     (attribute(DAMP, "Condition ", 1), "did you mean condition?. Rename it"),
-    (attribute(f"{DAMP}/v_th", "ofset", 1.0), "v_th.ofset: is not in the schema, did you mean"),
+    (misspell_offset, "v_th.ofset: is not in the schema, did you mean"),
     (make_sequence, "subject: cannot be read (it is a sequence of variable length)"),
     (put("curent", [1.0]), "curent: is not in the schema, did you mean current?"),
     (put("v_out", np.array([b"a", b"b"])), "v_out: has dtype |S1"),
