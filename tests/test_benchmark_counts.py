@@ -1,18 +1,26 @@
-"""The mathematics of the benchmarks: rates and intervals, what is silent, fronts, targets."""
+"""What the benchmarks count, and what they measure on."""
 
 import dataclasses
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
+import etid
 from benchmarks import perturbations, speed_accuracy, which
 from benchmarks.estimators import NOTHING, Answer
+from benchmarks.laboratory import SCALE
+from benchmarks.ladder import LOADS
+from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
 from benchmarks.machine import RESULTS
+from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
+from benchmarks.perturbed_study import undisturbed
 from benchmarks.rates import clopper_pearson, rate
 from benchmarks.runner import report
+from etid.simulation.scenes import Scene, Trial
 
-# --- rates ----------------------------------------------------------------------------------------
+FEW_RECORDINGS = 12
 
 
 @pytest.mark.parametrize(
@@ -27,9 +35,6 @@ def test_trials_behind_one_driver_are_not_independent(events, each, effective):
     found = rate(events, np.arange(len(events)) // each)
     assert found[:3] == pytest.approx((np.mean(events), *clopper_pearson(*effective)))
     assert found.trials == len(events)
-
-
-# --- answers --------------------------------------------------------------------------------------
 
 
 def answer(error: Any = 0.0, verdict="successful", stderr: Any = 0.01, bound: Any = 0.01, **more):
@@ -95,9 +100,46 @@ def test_silent_answers_are_excused_up_to_what_the_best_test_would_miss(answers,
     assert report(perturbations.targets(answers)) == met
 
 
-# --- error against time ---------------------------------------------------------------------------
-
-
 def test_the_readme_has_the_table_of_the_last_results():
     made, page = which.table(which.read(RESULTS / speed_accuracy.FILE)), which.README.read_text()
     assert which.inserted(page, made) == page, "run python -m benchmarks which"
+
+
+def test_an_undisturbed_recording_is_that_of_a_scene():
+    dry = PERTURBATIONS["base_no_delay"](undisturbed(3, 60.0)).trials[0]
+    found = dry.recording(0)
+    of = Scene((Trial("dry", LOADS["dry"]),), driver=dry.out.driver, snr_db=60.0)
+    theirs = of.simulate(0)["dry"]
+    for name in ("v_th", "v_out"):
+        ours, other = getattr(found, name), getattr(theirs, name)
+        # Both are the same voltage with white noise of one size: their difference is noise alone.
+        assert np.std(ours - other) == pytest.approx(np.sqrt(2) * dry.sigma / SCALE, rel=0.03)
+    assert found.adc_range == pytest.approx(theirs.adc_range)
+    assert (found.sample_rate, found.pulse_rate) == (theirs.sample_rate, theirs.pulse_rate)
+
+
+def test_every_perturbation_changes_what_is_recorded_or_told():
+    before = undisturbed(3, 60.0)
+    assert UNDISTURBED.keys() | INVISIBLE.keys() < PERTURBATIONS.keys()
+    for name, change in PERTURBATIONS.items():
+        after = change(before)
+        assert set(after.truths) == {of.path for of in after.trials} == set(LOADS), name
+        same = (after.calibrations, after.trials) == (before.calibrations, before.trials)
+        assert same == (name == "base"), name
+
+
+def test_large_files_follow_the_schema_in_all_layouts_and_are_made_once(tmp_path):
+    stacks = []
+    for layout in LAYOUTS:
+        path = large_file(tmp_path, FEW_RECORDINGS, layout)
+        assert etid.check(path) == []
+        with etid.read(path) as of:
+            assert (len(of.loaded), len(of.calibrations)) == (FEW_RECORDINGS, 1)
+            assert of["s0000/skin/0"].v_out.size == SAMPLES
+        before = path.stat().st_mtime_ns
+        assert large_file(tmp_path, FEW_RECORDINGS, layout).stat().st_mtime_ns == before
+        with h5py.File(path) as file:
+            stacks.append(np.asarray(file["s0000/skin/v_out"]))
+    np.testing.assert_array_equal(stacks[0], stacks[1])
+    np.testing.assert_array_equal(stacks[0], stacks[2])
+    assert (stacks[0][0] != stacks[0][1]).any()

@@ -153,6 +153,7 @@ def test_draws_keep_to_the_bounds_and_agree_with_the_fit(free, beyond):
     assert beyond.intervals()["r_s"][0] == above(free, 1.0)
 
 
+@pytest.mark.slow
 def test_profiles_keep_to_the_bounds(free, beyond):
     bound = above(free, 1.0)
     own, other = beyond.profile("r_s"), beyond.profile("r_p")

@@ -10,6 +10,8 @@ from etid.online.controller import RAISE
 
 PULSES = 150
 
+pytestmark = pytest.mark.slow  # `test_controller` has the limits for any estimate
+
 
 @functools.cache
 def hazards(snr=60.0):
@@ -51,7 +53,6 @@ def test_skin_gets_the_wanted_charge_and_a_quarter_more_at_a_pulse():
     assert (abs(steps.charge[reached] / WANTED - 1) < 0.02).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("snr", [60.0, 40.0])
 def test_the_cap_holds_at_a_hundred_thousand_pulses(snr):
     found, pulses = hazards(snr), 420

@@ -170,6 +170,25 @@ def test_depth_counts_and_links_have_limits(texts, change, message):
     assert any(message in problem.message for problem in hdf5.check(texts))
 
 
+def test_a_damaged_chunk_costs_its_own_recording(texts):
+    """Its checksum no longer fits, as after a bad sector; that is seen when samples are read."""
+    with h5py.File(texts, "r+") as file:
+        codes, attributes = file["s02/dry/v_out"][()], dict(file["s02/dry/v_out"].attrs)
+        del file["s02/dry/v_out"]
+        data = file.create_dataset("s02/dry/v_out", data=codes, chunks=codes.shape, fletcher32=True)
+        data.attrs.update(attributes)
+        file.flush()
+        offset = data.id.get_chunk_info(0).byte_offset
+    with texts.open("r+b") as raw:
+        raw.seek(offset + 50)
+        raw.write(b"\xff\x00\xff")
+    with etid.read(texts) as study:
+        assert "s02/dry" in study
+        with pytest.raises(etid.RecordingError, match="'s02/dry', v_out: "):
+            study["s02/dry"]
+        assert study["s01/dry/0"].v_out.size > 0
+
+
 # Files of fits
 
 
