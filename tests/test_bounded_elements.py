@@ -79,7 +79,7 @@ def test_several_bounded_elements_are_those_of_draws_inside_the_box():
     assert own.min() > 0
 
 
-@pytest.mark.parametrize("from_bound", [0.0, 0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("from_bound", [0.0, 1.0, 4.0])
 def test_intervals_contain_the_truth_as_often_as_they_say_near_and_far_from_a_bound(from_bound):
     """Between 94.2 and 97.3 % by quadrature; three standard deviations of 10 000 draws are 0.7."""
     truth, error = np.array([30e3, 180e3, 0.1e-9]), np.array([3e3, 3e3, 3e-12])

@@ -16,8 +16,8 @@ import shtab
 import etid
 from benchmarks.specimens import study_fits
 from etid import cli
-from etid.commands import fit
-from etid.simulation import calibration
+from etid.commands import calibrate, fit
+from etid.simulation.calibration import CheckedCalibration
 
 DONE, WRONG_DATA, WRONG_USAGE = 0, 1, 2
 
@@ -277,8 +277,10 @@ def test_json_of_fit_has_what_the_text_has(run, study_file, tmp_path):
 def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
     run, study_file, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(calibration, "SKINS", {})  # `test_calibration` fits them
-    monkeypatch.setattr(calibration, "_with_resistor", lambda *_: None)
+    [driver] = study_fits().drivers.values()
+    monkeypatch.setattr(
+        calibrate, "calibrate", lambda of, former: CheckedCalibration(driver, of, [1e-3], {})
+    )
     page = (pathlib.Path(__file__).parents[1] / "docs" / "command_line.md").read_text("utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", page, flags=re.MULTILINE))
     assert rows.keys() == cli.COMMANDS.keys()

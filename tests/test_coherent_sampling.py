@@ -1,16 +1,13 @@
-"""A pulse period of a whole number of samples: aliases fall on the harmonics.
+"""A pulse period of a whole number of samples: aliases fall on the harmonics."""
 
-The records are sums of harmonics up to 4 MHz, folded by hand: harmonic k falls on k modulo the
-number of samples of a period. Driver, loads and filter are formulas, so the truth is exact.
-"""
-
-import dataclasses
 import functools
 
 import numpy as np
 import pytest
 
 import etid
+from benchmarks.ladder import CALIBRATION, recorded
+from benchmarks.perturbed_study import drawn_driver
 from etid.signals.harmonics import ALIASED, aliases
 from etid.simulation.transformer import TransformerDriver
 
@@ -20,90 +17,31 @@ SKINS = {
     "dry": etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
     "damp": etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
 }
-REFERENCE = 98.8e3
-# As many harmonics as those of other tests, after padding, so that nothing is compiled for them.
-RATE, PULSES, PERIODS = 204e3, 60.0, 3
-HIGHEST = 4e6  # [Hz] harmonics above are below 1e-6 of the pulse, 16 edges of 250 ns
-PARTS = [
-    field.name
-    for field in dataclasses.fields(TransformerDriver)
-    if field.name.startswith(("r_", "l_", "c_"))
-]
 SIGMAS = 4.0  # one of 16 000 for a normal error; 600 elements are compared below
 
 
-def impedance(skin, f):
-    r_s, r_p, c_p = (float(value) for value in (skin.r_s, skin.r_p, skin.c_p))
-    return r_s + r_p / (1 + 2j * np.pi * f * r_p * c_p)
+def scene(number, *, rate=204e3, pulses=60.0, periods=3, filtered=True, snr_db=60.0):
+    """Both skins behind a drawn driver; the pulses begin anywhere between two samples.
 
-
-def butterworth(f, corner):
-    """Of fourth order: |H|² = 1 / (1 + (f / corner)⁸)."""
-    s, poles = 1j * f / corner, np.exp(1j * np.pi * (5 + 2 * np.arange(4)) / 8)
-    return 1 / np.prod(s - poles[:, None], axis=0)
-
-
-@dataclasses.dataclass
-class Bench:
-    """A driver, a converter and its filter; the pulses begin anywhere between two samples."""
-
-    seed: int
-    rate: float = RATE
-    pulses: float = PULSES
-    periods: int = PERIODS
-    snr_db: float = 60.0
-    filtered: bool = True
-
-    def __post_init__(self):
-        self.rng = np.random.default_rng(self.seed)
-        usual = TransformerDriver()
-        drawn = {name: getattr(usual, name) * self.rng.uniform(0.9, 1.1) for name in PARTS}
-        width = self.rng.choice([160 / 240e3, 0.04 / 60, 0.04 / self.pulses])
-        driver = TransformerDriver(**drawn, width=float(width))
-        self.k = np.arange(1, int(HIGHEST / self.pulses))
-        self.f = self.k * self.pulses
-        self.filter = butterworth(self.f, 0.4 * self.rate) if self.filtered else 1.0
-        self.x = self.pulses * driver.v_th_spectrum(self.f) * self.filter
-        self.z_th = driver.z_th(self.f)
-        self.start = self.rng.uniform(0, 1)
-        self.noise = np.sqrt(2 * np.sum(np.abs(self.x) ** 2)) * 10 ** (-self.snr_db / 20)
-
-    def folded(self, coefficients, late=0.0):
-        """One period of a waveform."""
-        size = round(self.rate / self.pulses)
-        c = coefficients * np.exp(2j * np.pi * self.f / self.rate * (self.start + late))
-        spectrum = np.zeros(size, complex)
-        np.add.at(spectrum, self.k % size, c)
-        return 2 * size * np.fft.ifft(spectrum).real
-
-    def record(self, coefficients, noise=None):
-        """Noisy periods, a tenth of a sample late or early."""
-        one = np.tile(self.folded(coefficients, 0.1 * self.rng.standard_normal()), self.periods)
-        return one + (self.noise if noise is None else noise) * self.rng.standard_normal(one.size)
-
-    def recording(self, path, z, **fields):
-        return etid.Recording(
-            self.record(self.x),
-            self.record(self.x * z / (z + self.z_th)),
-            sample_rate=self.rate,
-            pulse_rate=self.pulses,
-            adc_range=(-200.0, 200.0),
-            path=path,
-            **fields,
-        )
-
-    def calibration(self):
-        return self.recording("calibration", np.full(self.f.shape, REFERENCE), r_load=REFERENCE)
-
-    def loaded(self, name):
-        skin = self.recording(name, impedance(SKINS[name], self.f))
-        return skin.replace(calibration=("calibration",))
+    The usual rate gives as many harmonics as those of other tests, after padding, so that nothing
+    is compiled for them.
+    """
+    return recorded(
+        SKINS,
+        driver=drawn_driver(number, 0.05, TransformerDriver()),
+        sample_rate=rate,
+        pulse_rate=pulses,
+        samples=round(periods * rate / pulses),
+        start=0.37 / rate,
+        antialias=0.4 if filtered else 1e3,
+        trigger_jitter_rms=0.1 / rate,
+        snr_db=snr_db,
+    )
 
 
 @functools.cache
 def study(filtered):
-    bench = Bench(seed=1, filtered=filtered)
-    return etid.Study.from_recordings([bench.calibration(), *map(bench.loaded, SKINS)])
+    return scene(1, filtered=filtered).simulate(1)
 
 
 def each(fits):
@@ -129,9 +67,9 @@ def test_a_fit_is_by_maximum_likelihood_and_right(identify):
 
 def test_without_a_filter_the_records_are_biased():
     """Maximum likelihood would be up to fifty of its standard errors off."""
-    with pytest.raises(etid.IdentificationError, match=r"'calibration': biased.*anti-alias filter"):
-        etid.identify_driver(study(False)["calibration"])
-    driver = etid.identify_driver(study(True)["calibration"])
+    with pytest.raises(etid.IdentificationError, match=r"biased.*anti-alias filter"):
+        etid.identify_driver(study(False)[CALIBRATION])
+    driver = etid.identify_driver(study(True)[CALIBRATION])
     for name in SKINS:
         fit = etid.identify_skin(study(False)[name], driver, throw=False)
         assert fit.verdict == "biased"
@@ -139,36 +77,32 @@ def test_without_a_filter_the_records_are_biased():
     assert set(joint.fits.verdicts) == {"driver_failed"}
     assert all("biased" in note for note in joint.fits.notes)
     with pytest.raises(etid.IdentificationError, match="biased"):
-        etid.Tracker.of(driver, study(False)["calibration"], electrodes=1)
-
-
-def exact(bench, coefficients):
-    """Fourier coefficients of a period, with aliases and without, below half the rate."""
-    size = round(bench.rate / bench.pulses)
-    number = (size - 1) // 2
-    found = np.fft.rfft(bench.folded(coefficients))[1 : number + 1] / size
-    turned = coefficients * np.exp(2j * np.pi * bench.f / bench.rate * bench.start)
-    return found, turned[:number]
+        etid.Tracker.of(driver, study(False)[CALIBRATION], electrodes=1)
 
 
 @pytest.mark.parametrize(("rate", "pulses"), [(200e3, 50.0), (240e3, 60.0), (500e3, 50.0)])
 @pytest.mark.parametrize("load", ["open", *SKINS])
 def test_aliases_behind_a_filter_are_not_larger_than_estimated(rate, pulses, load):
     """Nor are they more than 20 times smaller where they matter most, at the highest harmonics."""
-    for seed in range(10):
-        bench = Bench(seed, rate, pulses)
-        x = bench.x
+    size = round(rate / pulses)
+    half = (size - 1) // 2
+    for number in range(10):
+        of = scene(number, rate=rate, pulses=pulses).waveform()
+        x, k = of.v_th, np.round(of.f / pulses).astype(int)
         if load != "open":
-            z = impedance(SKINS[load], bench.f)
-            x = x * z / (z + bench.z_th)
-        found, true = exact(bench, x)
-        size = round(rate / pulses)
+            z = np.asarray(SKINS[load].response(of.f))
+            x = x * z / (z + of.z_th)
+        x = x * np.exp(2j * np.pi * k / size * np.random.default_rng(number).uniform())
+        found = np.zeros(size, complex)  # folded by hand
+        np.add.at(found, k % size, x)
+        np.add.at(found, -k % size, x.conj())
+        found, true = found[1 : half + 1], x[:half]
         quiet = np.full(found.shape, 1e-12 * np.abs(found[-1]) ** 2)
-        of = aliases(found, quiet, 3, 3 * size)
+        estimated = aliases(found, quiet, 3, 3 * size)
         for part in (0.1, 0.2, 0.3, ALIASED):
             # 25 harmonics hold a whole lobe of the spectrum of a pulse.
             around = slice(round(part * size) - 25, round(part * size) + 25)
-            ratio = np.mean(of.power[around]) / np.mean(np.abs(found - true)[around] ** 2)
+            ratio = np.mean(estimated.power[around]) / np.mean(np.abs(found - true)[around] ** 2)
             assert ratio > 1
         assert ratio < 20
 
@@ -196,13 +130,13 @@ def drawn(**settings):
     """Errors of skins behind drawn drivers in standard errors; skins that are not fitted."""
     errors, others = [], []
     for draw in range(18):
-        bench = Bench(100 + draw, snr_db=(40.0, 60.0, 80.0)[draw % 3], **settings)
+        of = scene(100 + draw, snr_db=(40.0, 60.0, 80.0)[draw % 3], **settings).simulate(draw)
         try:
-            driver = etid.identify_driver(bench.calibration())
+            driver = etid.identify_driver(of[CALIBRATION])
         except etid.IdentificationError as error:
             others += [str(error).split(": ")[1].split(".")[0].split(",")[0]] * len(SKINS)
             continue
-        fits = etid.identify_skins([bench.loaded(name) for name in SKINS], driver)
+        fits = etid.identify_skins([of[name] for name in SKINS], driver)
         for fit, name in each(fits):
             if fit.verdict == "successful":
                 errors.append(off(fit, name))

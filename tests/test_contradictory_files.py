@@ -9,7 +9,7 @@ import scipy.io.wavfile
 
 import etid
 from tests import lab_files
-from tests.lab_files import LINE, rig
+from tests.lab_files import LINE, rig, table
 
 COUNT = 30
 V_TH = np.round(np.random.default_rng(8).normal(size=COUNT), 3)
@@ -26,12 +26,6 @@ def imported(path, **given):
 
 def refused(path, message, **given):
     assert lab_files.refused(path, None, message, **{**GIVEN, **given}).remedy
-
-
-def table(path, text):
-    file = path / "a.csv"
-    file.write_text(text, encoding="utf-8")
-    return file
 
 
 def rows(sign=".", between=",", end=""):

@@ -27,8 +27,9 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("how", ["raised", "lost"])
-@pytest.mark.parametrize("module", ["jax", "etid.commands.report"])
+@pytest.mark.parametrize(
+    ("module", "how"), [("jax", "raised"), ("jax", "lost"), ("etid.commands.report", "raised")]
+)
 def test_ctrl_c_during_the_imports_is_one_line(module, how):
     done = subprocess.run(
         [sys.executable, "-c", EARLY, module, how], capture_output=True, text=True, check=False

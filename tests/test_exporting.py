@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import dataclasses
 import datetime
 import json
 import re
@@ -10,7 +11,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import h5py
-import jax.numpy as jnp
 import numpy as np
 import pandas
 import pynwb
@@ -20,39 +20,22 @@ from pyarrow import parquet
 import etid
 from etid import cli
 from etid.files import exporting
-from etid.recordings.remarks import Remark
-from etid.results.fit import Fit
 from etid.results.fits import Fits
-from etid.results.verdicts import verdicts_of
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
+from tests import pictures
 
 START = datetime.datetime(2026, 1, 31, 9, 30, tzinfo=datetime.UTC)
-COUNT = 23
+COUNT = 12
 ELEMENTS = {"r_s": "ohm", "r_p": "ohm", "c_p": "farad"}
 
 
 @pytest.fixture(scope="module")
 def fits():
-    """Fits with labels and notes that a table has to quote, and one without a result."""
-    rng = np.random.default_rng(3)
-    values = {name: rng.lognormal(size=COUNT) for name in ELEMENTS}
-    values["r_p"][4] = np.nan
-    cov = np.einsum("n,ij->nij", rng.uniform(size=COUNT), np.eye(3))
-    fit = Fit(
-        circuit=etid.SkinRC(**{name: jnp.asarray(value) for name, value in values.items()}),
-        cov=cov,
-        shared_cov=cov / 4,
-        rrse=rng.uniform(size=COUNT),
-        chi2=rng.uniform(size=COUNT),
-        result=verdicts_of(np.array(["successful"] * 4 + ["flat"] + ["successful"] * (COUNT - 5))),
-        steps=np.arange(COUNT),
-        method="maximum_likelihood",
-        remarks=np.arange(COUNT) % 2 * int(Remark.mains_hum),
-    )
-    labels = {name: np.array([f"{name} {i}" for i in range(COUNT)], object)
-              for name in ("path", "subject", "condition", "electrode", "trial")}  # fmt: skip
+    """Fits of several verdicts with a note that a table has to quote."""
     notes = np.array([""] * COUNT, object)
     notes[4] = 'is "flat", to a µV\nand has no pulse'
-    return Fits(fit, labels, notes)
+    return dataclasses.replace(pictures.fits(), notes=notes)
 
 
 @pytest.fixture
@@ -62,9 +45,9 @@ def file(fits, tmp_path):
     return path
 
 
-@pytest.fixture(params=[1000, 7])
+@pytest.fixture(params=[1000, 5])
 def parts(request, monkeypatch):
-    """At once, and in four parts."""
+    """At once, and in three parts."""
     monkeypatch.setattr(exporting, "ROWS", request.param)
 
 
@@ -95,7 +78,7 @@ def test_no_text_of_a_csv_table_is_a_formula(fits, tmp_path):
     with (tmp_path / "fits.csv").open(newline="", encoding="utf-8") as text:
         rows = list(csv.DictReader(text))
     assert [row["subject"] for row in rows[:5]] == [f"'{text}" for text in texts]
-    assert rows[0]["path"] == "path 0"
+    assert rows[0]["path"] == "recording/00"
 
 
 def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_path):
@@ -114,10 +97,10 @@ def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_pa
 
 def test_a_circuit_of_impedance_py_has_the_identified_values(fits, file, tmp_path):
     target = tmp_path / "skin.json"
-    etid.export_circuit(file, target, "path 7")
+    etid.export_circuit(file, target, "recording/07")
     content = json.loads(target.read_text("utf-8"))
     string, values = etid.circuit_string(fits[7].circuit)
-    assert content.pop("Name") == "path 7, by etid"
+    assert content.pop("Name") == "recording/07, by etid"
     told = {"Circuit String": string, "Initial Guess": values, "Constants": {}, "Fit": False}
     assert content == told
     elements = fits[7].circuit
@@ -128,9 +111,9 @@ def test_a_circuit_of_impedance_py_has_the_identified_values(fits, file, tmp_pat
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        ("path 4", 'is flat, not successful; its circuit is not exported. is "flat", to a'),
-        ("path 99", "there is no fit of 'path 99'; the fits are of 'path 0', 'path 1', "),
-        (None, "say which recording; the fits are of 'path 0', "),
+        ("recording/04", 'is insensitive, not successful; its circuit is not exported. is "flat"'),
+        ("path 99", "there is no fit of 'path 99'; the fits are of 'recording/00', "),
+        (None, "say which recording; the fits are of 'recording/00', "),
     ],
 )
 def test_a_circuit_that_is_not_there_or_no_success_is_not_written(path, words, file, tmp_path):
@@ -150,28 +133,17 @@ def opened(path) -> Iterator[Any]:
 
 @pytest.fixture
 def study_file(tmp_path):
-    """A calibration and three trials that share an unloaded record; one more with a current."""
-    codes = np.random.default_rng(1).integers(-9000, 9000, size=(5, 400)).astype("i2")
-    shared = etid.Samples(codes[0], 0.0057)
-    common: dict[str, Any] = {"sample_rate": 200e3, "pulse_rate": 60.0}
-    skin: dict[str, Any] = {"subject": "s01", "condition": "dry", "calibration": "calibration/98k8"}
-    recordings = [
-        etid.Recording(shared, etid.Samples(codes[4], 0.0057), r_load=98.8e3, subject="s01",
-                       path="calibration/98k8", adc_range=(-186.9, 186.9), **common)
-    ]  # fmt: skip
-    recordings += [
-        etid.Recording(shared, etid.Samples(codes[i], 0.0057, 0.1), trial=i, path=f"s01/dry/{i}",
-                       **skin, **common)
-        for i in range(3)
-    ]  # fmt: skip
-    volts = np.random.default_rng(2).normal(size=(3, 400))
-    recordings.append(
-        etid.Recording(volts[0], volts[1], current=volts[2], path="s01/damp", electrode="E1",
-                       subject="s01", **common)
-    )  # fmt: skip
-    path = tmp_path / "study.h5"
-    etid.Study.from_recordings(recordings).write(path)
-    return path
+    """A calibration and two trials that share an unloaded record; one more with a current."""
+    trials = tuple(
+        Trial(f"s01/dry/{i}", ResistorLoad(1e4), "s01", "dry", trial=str(i)) for i in range(2)
+    )
+    known = (Trial("calibration/98k8", ResistorLoad(98.8e3), "s01"),)
+    shared = Scene(trials, known, samples=400, shared_v_th=True).simulate(1)
+    v_th, v_out, current = np.random.default_rng(2).normal(size=(3, 400))
+    damp = etid.Recording(v_th, v_out, current=current, path="s01/damp", electrode="E1",
+                          subject="s01", sample_rate=200e3, pulse_rate=60.0)  # fmt: skip
+    etid.Study.from_recordings([*shared.recordings(), damp]).write(tmp_path / "study.h5")
+    return tmp_path / "study.h5"
 
 
 def test_nwb_holds_what_was_stored_and_all_that_was_said(study_file, tmp_path):

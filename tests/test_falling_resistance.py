@@ -90,7 +90,8 @@ def with_current(of: Record, seed: int) -> etid.Recording:
     return of.recording(seed).replace(current=i + noise)
 
 
-@pytest.mark.parametrize("snr_db", [40.0, pytest.param(60.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [40.0, 60.0])
 def test_skin_that_loses_a_twentieth_is_seen_with_a_driver_and_a_current(snr_db):
     """χ² is 1.0 to 1.1 at 40 dB; without this score all were `successful`."""
     study = nonlinear(0.05)(undisturbed(1, snr_db))

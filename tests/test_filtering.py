@@ -33,7 +33,7 @@ def random_filter(seed, order):
 
 @pytest.mark.parametrize(
     ("order", "time"),
-    [(1, 5), (2, BLOCK - 1), (3, BLOCK), (4, BLOCK + 1), (5, 10 * BLOCK), (6, 30 * BLOCK + 7)],
+    [(1, 5), (3, BLOCK), (4, BLOCK + 1), (6, 30 * BLOCK + 7)],
 )
 def test_equals_scipy_with_initial_state(order, time):
     b, a, rng = random_filter(order, order)

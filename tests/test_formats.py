@@ -14,7 +14,7 @@ from etid.files import channel as channels
 from etid.files.channel import UNITS, parse_unit
 from etid.files.readers import delimited as text_rows
 from etid.recordings.recording import RecordingError
-from tests.lab_files import LINE, abf, imported, matlab, refused, rig, tdms
+from tests.lab_files import LINE, abf, imported, matlab, refused, rig, table, tdms
 
 README = pathlib.Path(__file__).parents[1] / "data_schema" / "README.md"
 RNG = np.random.default_rng(6)
@@ -51,8 +51,7 @@ def example(format):
 
 def test_the_csv_of_the_readme_is_imported_by_its_mapping(tmp_path):
     section = README.read_text("utf-8").split("### CSV\n")[1]
-    path = tmp_path / "scope.csv"
-    path.write_text(section.split("```text\n")[1].split("```")[0], encoding="utf-8")
+    path = table(tmp_path, section.split("```text\n")[1].split("```")[0])
     recordings, used = imported(path, example("CSV"))
     one = recordings["s01/dry"]
     assert (one.subject, one.condition, one.pulse_rate) == ("s01", "dry", 60.0)
@@ -180,15 +179,13 @@ def test_an_abf_file_that_was_cut_off_is_refused(tmp_path):
      "open,skin\nmV,mV", '"open [mV]","skin (mV)"'],
 )  # fmt: skip
 def test_units_of_a_table_may_stand_in_its_first_or_second_line(head, tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text(f"{head}\n1,2\n3,4\n\n5,6\n", encoding="utf-8")
+    path = table(tmp_path, f"{head}\n1,2\n3,4\n\n5,6\n")
     recordings, _ = imported(path, pair("open", "skin", sample_rate=2e5))
     np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 53.5)
 
 
 def test_a_table_without_names_has_numbered_columns(tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text("1,2\n3,4\n5,6\n", encoding="utf-8")
+    path = table(tmp_path, "1,2\n3,4\n5,6\n")
     refused(path, pair("1", "2", sample_rate=2e5), r"the columns 1, 2\. .* add --header-line 0")
     recordings, _ = imported(path, columns("1", "2", sample_rate=2e5, header_line=0))
     np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 0.0535)
