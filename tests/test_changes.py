@@ -94,6 +94,21 @@ def test_a_change_matters_from_the_size_that_is_allowed_on():
     assert not change_of(recording, scene, skin, allowed=0.13).seen
 
 
+def test_courses_are_a_line_each_step_and_each_single_period():
+    steps = [np.arange(5) >= first for first in (1, 2, 3, 4)]
+    inner = [np.arange(5) == one for one in (1, 2, 3)]
+    expected = np.array([np.arange(5), *steps, *inner], float)
+    expected -= expected.mean(axis=1, keepdims=True)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(changes.courses(5), expected)
+
+
+def test_an_element_that_moves_alone_is_seen_where_all_together_hide_it():
+    """One of the records at 40 dB in which R_p falls by 5 % and χ² of all four is too small."""
+    scene, skin = rung("dry", snr_db=40.0), LOADS["dry"]
+    assert change_of(recorded(scene, falling(skin, "r_p", 0.05), seed=21), scene, skin).seen
+
+
 def test_noise_that_is_larger_between_periods_than_within_is_no_change():
     """Coloured noise: three times the scatter between periods makes three times the error."""
     scene, skin = rung("dry", samples=16_667), LOADS["dry"]
