@@ -38,11 +38,28 @@ def random_filter(seed, order):
 def test_equals_scipy_with_initial_state(order, time):
     b, a, rng = random_filter(order, order)
     x, zi = rng.normal(size=time), rng.normal(size=order)
-    y, zf = lfilter(jnp.array(b), jnp.array(a), jnp.array(x), jnp.array(zi))
+    y, zf = lfilter(jnp.array(2 * b), jnp.array(2 * a), jnp.array(x), jnp.array(zi))
     expected, final = scipy.signal.lfilter(b, a, x, zi=zi)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(y, expected, atol=ROUNDING * scale)
     np.testing.assert_allclose(zf, final, atol=ROUNDING * scale)
+
+
+def test_derivatives_agree_with_differences(getkey):
+    """Along one direction of coefficients, input and state; the recursion has a rule of its own."""
+    b, a = np.array([1.0, -0.5, 0.3, 0.2]), np.poly([0.9 + 0.1j, 0.9 - 0.1j, 0.8]).real
+    x, zi = jax.random.normal(getkey(), (3 * BLOCK + 9,)), jax.random.normal(getkey(), (3,))
+    at = jnp.array(b), jnp.array(2 * a), x, zi
+    ways = tuple(jax.random.normal(getkey(), part.shape) for part in at)
+    _, found = jax.jit(lambda *of: jax.jvp(filtering.lfilter, of, ways))(*at)
+    step = 1e-6  # error step² of the third derivative, rounding 1e-16 / step
+    low, high = (
+        lfilter(*(part + sign * way for part, way in zip(at, ways, strict=True)))
+        for sign in (-step, step)
+    )
+    for tangent, one, other in zip(found, low, high, strict=True):
+        expected = (other - one) / 2 / step
+        np.testing.assert_allclose(tangent, expected, atol=1e-6 * jnp.abs(expected).max())
 
 
 def test_second_derivatives_agree_with_differences_of_the_first(getkey):
