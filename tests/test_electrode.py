@@ -1,6 +1,8 @@
 """The state of one electrode after a pulse, against the same rules written for one electrode."""
 
+import dataclasses
 import itertools
+import types
 from typing import Any, NamedTuple
 
 import jax
@@ -9,11 +11,27 @@ import numpy as np
 import pytest
 
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
-from etid.online import alarms
-from etid.online.alarms import GainScore
-from etid.online.state import DRIFT, JUMP, NONE, ElectrodeState
-from etid.online.tick import PATIENCE, Attempt, Measured, Suspicion, after_pulse
-from etid.results.verdicts import RESULTS, verdict_names
+from etid.estimators.score_tests.other_circuit import MOVED
+from etid.estimators.unknowns import LoadUnknowns
+from etid.online import alarms, tick
+from etid.online import state as states
+from etid.online.alarms import SEEN_GAIN, GainScore
+from etid.online.gain_bands import Bands
+from etid.online.projection import Seen
+from etid.online.pulse_fit import Expected, GainModel
+from etid.online.state import DRIFT, JUMP, NONE, ElectrodeState, TrackerState
+from etid.online.tick import (
+    PATIENCE,
+    Attempt,
+    Measured,
+    Suspicion,
+    after_pulse,
+    anew,
+    attempt,
+    predicted,
+    suspicion,
+)
+from etid.results.verdicts import RESULTS, first_verdict, verdict_names, verdicts_of
 
 NUMBER, LIMIT = 77, 10.0
 POWERS = np.array([1.0, -1.0])  # of a resistor and of a capacitor
@@ -188,7 +206,139 @@ def test_the_state_after_a_pulse_follows_its_rules_in_every_case():
     assert not wrong, (len(wrong), wrong[:3])
 
 
+def test_what_is_known_after_a_walk_is_the_sum_of_covariances():
+    found = predicted(jnp.asarray(BEFORE), jnp.asarray(0.3))
+    inverse = np.linalg.inv(np.linalg.inv(BEFORE) + 0.3**2 * np.eye(2))
+    np.testing.assert_allclose(found, inverse, rtol=1e-12)
+
+
+@pytest.mark.parametrize("limit", [0.5, 2.0])
+def test_a_pulse_is_suspected_by_the_distance_from_its_prediction(limit):
+    """T = δᵀ (Λ⁻¹ + cov)⁻¹ δ of the fit of the pulse alone, δ = δ₊ + cov Λ δ₊."""
+    of = Case(True, True, True, True, "good", False, 0, False, False, False)
+    state, _, before, found, *_ = electrode(of)
+    off = (found.own - state["own"])[:2]
+    alone = off + found.spread @ before @ off
+    statistic = alone @ np.linalg.inv(np.linalg.inv(before) + found.spread) @ alone
+
+    def suspected(running, good, part):
+        pulses = {"pulses": 12 if running else 0}
+        of = ElectrodeState(**jax.tree.map(jnp.asarray, state | pulses))
+        fit = found._replace(result=GOOD if good else BAD)
+        fit = jax.tree.map(jnp.asarray, fit)
+        arguments = jnp.asarray(before), jnp.array([0.6, 0.8]), jnp.asarray(part * statistic)
+        return jax.jit(suspicion)(of, fit, *arguments)
+
+    assert bool(suspected(True, True, limit).jump) == (limit < 1)
+    assert bool(suspected(True, False, limit).jump)
+    assert not bool(suspected(True, False, limit).drift)
+    assert not bool(suspected(False, True, limit).jump)
+    assert not bool(suspected(False, False, limit).drift)
+
+
+class Minimum(NamedTuple):
+    """What is found at the minimum of a pulse."""
+
+    squares: Any
+    curvature: Any
+
+
+CURVED = np.array([[50.0, 4.0, 3.0], [4.0, 40.0, -2.0], [3.0, -2.0, 9.0]])
+
+
+@pytest.mark.parametrize(
+    ("bad", "own", "decrement", "squares", "verdict"),
+    [
+        (SUCCESSFUL, 0.1, 0.1, 3.0, SUCCESSFUL),
+        (RESULTS.saturated, 0.1, 0.1, 3.0, RESULTS.saturated),
+        (RESULTS.saturated, np.nan, 5.0, 9e9, RESULTS.saturated),
+        (SUCCESSFUL, np.nan, 5.0, 9e9, RESULTS.nonphysical),
+        (SUCCESSFUL, 0.1, 5.0, 9e9, MAX_STEPS_REACHED),
+        (SUCCESSFUL, 0.1, np.nan, 3.0, MAX_STEPS_REACHED),
+        (SUCCESSFUL, 0.1, 0.1, 9e9, RESULTS.misfit),
+        (SUCCESSFUL, 1.7, 0.1, 3.0, RESULTS.misfit),
+        (SUCCESSFUL, -1.7, 0.1, 3.0, RESULTS.misfit),
+        (SUCCESSFUL, 1.4, 0.1, 3.0, SUCCESSFUL),
+    ],
+)
+def test_the_worst_that_a_pulse_shows_is_its_verdict(
+    monkeypatch, bad, own, decrement, squares, verdict
+):
+    """Bad samples, then no number, then no minimum, then a misfit or a delay out of its range."""
+    logs = np.array([1.0, 2.0, own])
+    at = Minimum(jnp.asarray(squares), jnp.asarray(CURVED))
+    monkeypatch.setattr(
+        "etid.online.tick.minimum",
+        lambda *_: (jnp.asarray(logs), at, jnp.asarray(decrement), jnp.zeros(6)),
+    )
+    nothing = GainScore(jnp.zeros(3), jnp.zeros(2))
+    monkeypatch.setattr(GainScore, "of", lambda *_: nothing)
+    monkeypatch.setattr("etid.online.tick.Pulse", lambda *_: None)
+    weight, gain = np.array([3.0, 2.0, 0.0]), np.array([1 + 1j, 2j, 5.0])
+    measured = Measured(
+        gain=jnp.asarray(gain),
+        variance=jnp.asarray(0.01),
+        weight=jnp.asarray(weight),
+        level=jnp.asarray(0.5),
+        amplitude=jnp.asarray(1.0),
+        offset=jnp.asarray(0.0),
+        steady=jnp.asarray(True),
+        shown=jnp.asarray(4.0),
+        bad=first_verdict((jnp.asarray(True), bad)),
+    )
+    monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
+    model = object.__new__(GainModel)  # only these two fields are read
+    object.__setattr__(model, "bands", types.SimpleNamespace(weight=jnp.asarray(weight)))
+    object.__setattr__(model, "noise_freedom", jnp.asarray(1000.0))
+    start = LoadUnknowns.of(jnp.asarray(logs))
+    none = jnp.zeros(3, complex)
+    expected = Expected(none, jnp.zeros((2, 3), complex), none)
+    found = attempt(model, measured, start, expected, jnp.zeros(2), jnp.zeros((2, 2)))
+    assert bool(found.result == verdict)
+    # Two bands have two numbers each, and three are fitted.
+    np.testing.assert_allclose(found.chi2, squares / (2 * 2 - 3))
+    power = (weight * abs(gain) ** 2).sum()
+    np.testing.assert_allclose(found.rrse, np.sqrt(squares * 0.01 / power))
+    told = np.linalg.inv(np.linalg.inv(CURVED)[:2, :2])  # the delay is free
+    np.testing.assert_allclose(found.information, told)
+    np.testing.assert_allclose(found.spread, np.linalg.inv(told))
+
+
+@pytest.mark.parametrize(
+    ("score", "moved", "wrong"),
+    [
+        (SEEN_GAIN * 5.01, [0.0, 9.0], True),
+        (-SEEN_GAIN * 5.01, [-9.0, 0.0], True),
+        (SEEN_GAIN * 4.99, [0.0, 9.0], False),
+        (SEEN_GAIN * 10, [0.0, 1.01 * MOVED / (SEEN_GAIN * 5) * 16], True),
+        (SEEN_GAIN * 10, [0.0, 0.99 * MOVED / (SEEN_GAIN * 5) * 16], False),
+        (np.nan, [0.0, 9.0], False),
+    ],
+)
+def test_a_gain_is_wrong_if_all_noise_and_one_that_does_not_matter_are_less(score, moved, wrong):
+    """The variance is 16 by the pulses and 3² by the calibrations: a standard deviation of 5."""
+    found = GainScore(jnp.array([score, 16.0, 3.0]), jnp.array(moved))
+    assert bool(found.wrong()) == wrong
+
+
 # --- changes --------------------------------------------------------------------------------------
+
+
+def test_an_innovation_and_its_moving_mean_are_those_of_their_formulas():
+    d, direction = np.array([0.3, -0.2]), np.array([1.0, -2.0])
+    spread = np.linalg.inv(TOLD)
+    new = alarms.Innovation.of(*map(jnp.asarray, (d, spread, BEFORE)))
+    cov = spread + np.linalg.inv(BEFORE)
+    weight = np.linalg.inv(cov)
+    np.testing.assert_allclose(new.cov, cov)
+    np.testing.assert_allclose(new.statistic(), d @ weight @ d)
+    along = direction @ weight @ d / np.sqrt(direction @ weight @ direction)
+    np.testing.assert_allclose(new.along(jnp.asarray(direction)), along)
+    mean = np.array([0.1, 0.4])
+    moving = alarms.averaged(jnp.asarray(mean), jnp.asarray(BEFORE / 1e4), new)
+    np.testing.assert_allclose(moving.d, 0.9 * mean + 0.1 * d)
+    np.testing.assert_allclose(moving.cov, 0.81 * BEFORE / 1e4 + 0.01 * cov)
+    np.testing.assert_allclose(moving.weight, np.linalg.inv(moving.cov))
 
 
 LANES = 20
@@ -228,4 +378,163 @@ def test_the_driver_has_changed_if_most_electrodes_move_one_way(z, jumps, counte
     assert bool(found) == expected
 
 
+def test_a_few_electrodes_in_trouble_are_not_the_driver_while_the_others_change_their_amplitude():
+    counts, running = np.arange(LANES) < alarms.COMMON, np.arange(LANES) < 2 * alarms.COMMON
+    values = np.where(counts, 99.0, 0.0) * np.ones((2, 1))
+    for jumped in (counts, ~counts):
+        found = alarms.driver_change(*map(jnp.asarray, (jumped, values, counts, running)))
+        assert not bool(found)
+
+
+def state_of(**fields: Any) -> TrackerState:
+    """A state after pulse 100 of as many electrodes as a field has."""
+    count = max(len(value) for value in fields.values())
+    one = electrode(Case(True, False, False, True, "good", False, 0, False, False, False))[0]
+    lanes: dict[str, Any] = {
+        name: jnp.asarray(np.stack([value] * count))
+        for name, value in one.items()
+        if name != "result"
+    }
+    verdicts = fields.pop("verdicts", ["successful"] * count)
+    lanes["result"] = jax.tree.map(jnp.asarray, verdicts_of(np.array(verdicts)))
+    lanes |= {name: jnp.asarray(value) for name, value in fields.items()}
+    no = jnp.asarray(False)
+    return TrackerState(ElectrodeState(**lanes), jnp.asarray(100), no, no)
+
+
+def test_what_a_pulse_has_shown_is_listed():
+    factor = np.log([[2.0, 3.0], [4.0, 5.0], [6.0, 7.0]])
+    state = state_of(
+        event=np.array([NONE, JUMP, DRIFT]), element=np.array([0, 1, 0]), factor=factor
+    )
+    jump, drift = states.changes(state, ("r_s", "r_p"))
+    assert (jump.pulse, jump.electrode, jump.kind, jump.element) == (100, 1, "jump", "r_p")
+    assert (drift.electrode, drift.kind, drift.element) == (2, "drift", "r_s")
+    np.testing.assert_allclose([jump.factor, drift.factor], [5.0, 6.0])
+    driver = dataclasses.replace(state, driver_event=jnp.asarray(True))
+    [found] = states.changes(driver, ("r_s", "r_p"))
+    assert (found.pulse, found.electrode, found.kind, found.element) == (100, None, "driver", "")
+    assert np.isnan(found.factor)
+
+
+def test_an_electrode_that_cannot_be_used_has_the_first_reason_that_applies():
+    last = 100 - states.RECENT
+    cases = [  # level, impedance, pulses, drifted, verdict, reason
+        (0.5, 1e3, 9, -1, "successful", None),
+        (0.5, 1e3, 9, -1, "unconnected", "open"),
+        (0.0199, 1e3, 9, -1, "unconnected", "open"),
+        (0.0199, 1e3, 0, -1, "flat", "shorted"),
+        (0.0201, 1e3, 0, -1, "flat", None),
+        (0.5, 701e3, 1, -1, "misfit", "dry"),
+        (0.5, 699e3, 1, -1, "misfit", None),
+        (0.5, 701e3, 0, -1, "misfit", None),
+        (0.5, 1e3, 9, last, "successful", None),
+        (0.5, 1e3, 9, last + 1, "successful", "drifting"),
+        (0.5, 701e3, 9, 100, "successful", "dry"),
+    ]
+    level, impedance, pulses, drifted, verdicts, reasons = map(list, zip(*cases, strict=True))
+    state = state_of(
+        level=np.array(level), pulses=np.array(pulses), drifted=np.array(drifted), verdicts=verdicts
+    )
+    found = states.bad_electrodes(state, np.array(impedance))
+    assert found == {number: why for number, why in enumerate(reasons) if why}
+    early = dataclasses.replace(state, number=jnp.asarray(5))  # none has drifted yet
+    early = states.bad_electrodes(
+        dataclasses.replace(
+            early,
+            electrodes=state_of(drifted=np.array([-1, 0]), pulses=np.array([1, 1])).electrodes,
+        ),
+        np.array([1e3, 1e3]),
+    )
+    assert early == {1: "drifting"}
+
+
 # --- what a pulse shows ---------------------------------------------------------------------------
+
+
+def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch):
+    """Level, offset and amplitude, and the first verdict that applies, from the measured gains."""
+    weight = np.array([3.0, 2.0, 0.0])
+    rows = [  # amplitude, amplitude before, mean, gain, variance, clipped, offset before, verdict
+        (1.0, 1.0, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (2.0, 1.0, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (2.0, np.nan, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (1.0, 0.905, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (1.0, 0.895, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (1.0, 1.0, 0.1, 0.5, np.nan, True, 0.2, "nonfinite_samples"),
+        (1.0, 1.0, np.nan, 0.5, 1e-3, True, 0.2, "nonfinite_samples"),
+        (1.0, 2.0, 0.1, 0.5, 1e-3, True, np.nan, "saturated"),
+        (1.0, 2.0, 0.1, 1e-3, 1e-1, False, np.nan, "too_short"),
+        (1.0, 1.0, 0.1, 1e-3, 1e-1, False, 0.2, "flat"),
+        (0.0, 1.0, 0.1, 0.995, 1e-3, False, 0.2, "flat"),
+        (1.0, 1.0, 0.1, 0.9902, 1e-6, False, 0.2, "unconnected"),
+        (1.0, 1.0, 0.1, 0.9898, 1e-6, False, 0.2, "successful"),
+        (1.0, 1.0, 0.1, 1.0098, 1e-6, False, 0.2, "unconnected"),
+        (1.0, 1.0, 0.1, 1.0102, 1e-6, False, 0.2, "successful"),
+        (4.0, 4.0, 0.1, 4 * 0.9902, 1e-6, False, 0.2, "unconnected"),
+        (1.0, 1.0, 0.1, np.sqrt(3.99e-2 * 4 / 5), 1e-2, False, 0.2, "flat"),
+        (1.0, 1.0, 0.1, np.sqrt(4.01e-2 * 4 / 5), 1e-2, False, 0.2, "successful"),
+    ]
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    amplitude, before, mean, gain, variance, clipped, offset, verdict = columns
+    used = []
+
+    def measure(self, seen, lacking, offset):
+        used.append((np.asarray(lacking), np.asarray(offset)))
+        wide = jnp.asarray(gain[:, None] * np.exp(1j * np.arange(3))[None, :])
+        return wide, jnp.ones((len(rows), 3))
+
+    monkeypatch.setattr(Bands, "measure", measure)
+    bands = object.__new__(Bands)  # only its weights are read
+    object.__setattr__(bands, "weight", jnp.asarray(weight))
+    zero = np.zeros(len(rows))
+    sums = np.stack([*np.zeros((6, len(rows))), mean, zero, zero], axis=1)
+    seen = Seen(sums, variance, clipped)
+    state = state_of(amplitude=before, offset=offset).electrodes
+    found = tick.measured_pulse(bands, seen, jnp.asarray(amplitude), state)
+    relative = np.where(amplitude > 0, amplitude, 1.0)
+    lacking = np.where(np.isnan(before), 0.0, (relative - before) / relative)
+    steady = abs(lacking) < tick.STEADY
+    known = np.where(np.isfinite(mean) & np.isfinite(variance) & steady, mean, offset)
+    np.testing.assert_allclose(used[0][0], lacking)
+    np.testing.assert_allclose(used[0][1], np.where(np.isnan(known), 0.0, known))
+    np.testing.assert_array_equal(found.steady, steady)
+    np.testing.assert_array_equal(found.offset, known)
+    np.testing.assert_array_equal(found.amplitude, amplitude)
+    np.testing.assert_allclose(found.variance, variance / relative**2)
+    np.testing.assert_allclose(found.weight, np.repeat(relative[:, None] ** 2, 3, axis=1))
+    np.testing.assert_allclose(abs(np.asarray(found.gain))[:, 0], gain / relative)
+    # Two bands tell something, each by two numbers.
+    power = np.maximum(gain**2 * weight.sum() - 4 * variance, 0.0) / weight.sum()
+    np.testing.assert_allclose(found.level, np.sqrt(power) / relative)
+    assert verdict_names(found.bad).tolist() == verdict.tolist()
+
+
+@pytest.mark.parametrize(
+    ("spread", "result", "verdict"),
+    [
+        ([0.5, 0.9], GOOD, "successful"),
+        ([0.5, 1.1], GOOD, "insensitive"),
+        ([1.1, 0.5], GOOD, "insensitive"),
+        ([np.nan, 0.5], GOOD, "insensitive"),
+        ([1.1, 0.5], BAD, "misfit"),
+    ],
+)
+def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(
+    monkeypatch, spread, result, verdict
+):
+    zero, two = jnp.zeros(()), jnp.zeros(2)
+    monkeypatch.setattr(tick, "nearest_delay", lambda *_: (zero, zero))
+    monkeypatch.setattr(tick, "searched", lambda *_: jnp.zeros(3))
+    monkeypatch.setattr(tick, "Pulse", lambda *_: types.SimpleNamespace(equations_at=None))
+    for name in ("departure", "undelayed", "expected"):
+        monkeypatch.setattr(GainModel, name, lambda *_: jnp.zeros(3, complex))
+    fit = ATTEMPT(
+        jnp.zeros(3), two, jnp.diag(jnp.array(spread)), zero, zero,
+        first_verdict((jnp.asarray(True), result)), GainScore(jnp.zeros(3), two),
+    )  # fmt: skip
+    monkeypatch.setattr(tick, "attempt", lambda *_: fit)
+    measured = MEASURED(jnp.zeros(3, complex), zero, jnp.ones(3), *[zero] * 6)
+    model = object.__new__(GainModel)
+    found = anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two)
+    assert str(verdict_names(found.result)) == verdict

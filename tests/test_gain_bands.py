@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from etid.online import gain_bands
+from etid.online import projection as projection_of
 from etid.online.gain_bands import LAST_BAND, RELATIVE, WIDEST, Bands, unloaded_bands
 from etid.signals.harmonics import ALIASED
 from etid.signals.noise import RIPPLE
@@ -45,6 +46,7 @@ def bands_of(of):
 
 
 measured = jax.jit(Bands.measure)
+lacking_tail = jax.jit(Bands._lacking_tail)
 
 
 @pytest.mark.parametrize("bins", [40, 100, 333, 1000])
@@ -153,3 +155,66 @@ def test_what_a_window_lacks_of_the_tail_is_added_to_the_gain(exact):
     unsure = np.asarray(of.weight) * abs(0.2 * np.asarray(found - before)) ** 2 / 2
     expected = np.asarray(of.weight) / (np.asarray(seen.variance)[:, None] + unsure)
     np.testing.assert_allclose(weight, expected, rtol=1e-6)
+
+
+def test_edges_are_what_stands_out_of_the_noise_of_the_mean_period():
+    sigma = 25.0
+    noise = sigma * np.random.default_rng(2).standard_normal(3 * SIZE)
+    v_th = np.tile(window(), 3) + noise
+    _, projection = unloaded_bands(v_th, sigma, RATE, float(SIZE))
+    mean = v_th.reshape(3, SIZE).mean(0)
+    found = {
+        of: tuple(projection_of._partition(mean, of, projection.block)[0])
+        for of in (sigma / np.sqrt(3), sigma * np.sqrt(3))
+    }
+    assert projection.pieces == found[sigma / np.sqrt(3)]
+    assert projection.pieces != found[sigma * np.sqrt(3)]
+
+
+def test_the_tail_of_a_load_has_its_own_rate_as_far_as_noise_lets_it_be_seen(exact):
+    of, projection = exact
+    t, lacking = np.arange(SIZE), np.full(4, 0.5)
+    v_out = np.stack([np.exp(-1.01 * DECAY * t)] * 3 + [np.exp(-DECAY * t[::-1])])
+    last, middle = round(gain_bands.LAST * SIZE), SIZE // 2
+    early, late = v_out[:, middle : middle + last].mean(1), v_out[:, -last:].mean(1)
+    span = DECAY * (SIZE - last - middle)
+    # Noise by which the logarithm of the rate is as uncertain as loads make it.
+    equal = (0.2 * span) ** 2 * SIZE * last / (early[0] ** -2 + late[0] ** -2)
+    seen = projection.seen(v_out, UNLIMITED)
+    for found, mean in zip(seen.means(), (v_out.mean(1), early, late), strict=True):
+        np.testing.assert_allclose(found, mean, rtol=1e-6)
+    variance = np.array([0.0, equal, 1e9 * equal, 0.0])
+    sums = np.column_stack([seen.sums[:, :-2], early, late])
+    seen = seen._replace(sums=sums, variance=variance)
+    found = np.asarray(lacking_tail(of, seen, lacking, np.zeros(4)))
+    left = late / (1 - 0.5 * np.exp(-1.0))
+    shape, by_rate = np.asarray(of.tail)
+    for i, part in enumerate((0.01, 0.005, 0.0, 0.0)):
+        expected = 0.5 * left[i] * (shape + part * by_rate)
+        np.testing.assert_allclose(found[i], expected, atol=1e-6 * abs(expected).max())
+    # The second row of the tail is the derivative with respect to the logarithm of the rate.
+    later = np.arange(SIZE) + last / 2
+    x = np.asarray(of.x)
+
+    def projected(rate):
+        e = np.fft.rfft(np.exp(-rate * later))[1 : x.size + 1] * x.conj()
+        strengths = [(abs(x[k - 1]) ** 2).sum() for k in bands_of(of)]
+        return np.array([e[k - 1].sum() for k in bands_of(of)]) / strengths
+
+    np.testing.assert_allclose(shape, projected(DECAY), atol=1e-6 * abs(shape).max())
+    step = 1e-4
+    slope = (projected(DECAY * (1 + step)) - projected(DECAY * (1 - step))) / (2 * step)
+    np.testing.assert_allclose(by_rate, slope, atol=1e-6 * abs(slope).max())
+    assert of.tail_left == pytest.approx(np.exp(-1.0), rel=1e-6)
+
+
+def test_aliases_of_periods_at_three_phases_are_those_of_a_gaussian_pulse():
+    period, width = SIZE + 1 / 3, 0.9
+    t = np.arange(9 * SIZE) % period - 40
+    of, _ = unloaded_bands(np.exp(-0.5 * (t / width) ** 2), 1e-6, RATE, period)
+    w = 2 * np.pi * np.arange(1, of.x.size + 1) / SIZE
+    x, aliased = (np.exp(-0.5 * (width * at) ** 2 - 40j * at) for at in (w, w - 2 * np.pi))
+    product, size = x.conj() * aliased, abs(x) ** 2
+    expected = np.array([product[k - 1].sum() / size[k - 1].sum() for k in bands_of(of)])
+    # A window is a third of a sample shorter than a period.
+    np.testing.assert_allclose(of.alias, expected, atol=1e-2 * abs(expected).max())
