@@ -2,6 +2,7 @@
 
 import re
 import tracemalloc
+from typing import Any
 
 import h5py
 import numpy as np
@@ -170,7 +171,8 @@ def test_depth_counts_and_links_have_limits(texts, change, message):
 def test_a_damaged_chunk_costs_its_own_recording(texts):
     """Its checksum no longer fits, as after a bad sector; that is seen when samples are read."""
     with h5py.File(texts, "r+") as file:
-        codes, attributes = file["s02/dry/v_out"][()], dict(file["s02/dry/v_out"].attrs)
+        whole: Any = file["s02/dry/v_out"]
+        codes, attributes = whole[()], dict(whole.attrs)
         del file["s02/dry/v_out"]
         data = file.create_dataset("s02/dry/v_out", data=codes, chunks=codes.shape, fletcher32=True)
         data.attrs.update(attributes)
