@@ -34,6 +34,13 @@ def refused(source, mapping, message, **given):
     return caught.value
 
 
+def table(folder, text):
+    """A CSV file with this text."""
+    path = folder / "a.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
 def rig(path, v_th, v_out, **own):
     """A TDMS file of two channels in volts at 200 kHz; `own` are properties of the second."""
     channels = {"rig/open": (v_th, {}), "rig/skin": (v_out, own)}

@@ -58,12 +58,6 @@ def test_the_lag_is_found_to_less_than_a_sample_at_20_db(sample_rate, late):
         assert (whole_lag(lag) == 0) == (late == 0.0)
 
 
-def test_a_late_record_without_a_load_is_unconnected():
-    record = simulate(5.0, periods=1.0)["dry"]
-    both = record.replace(v_out=np.roll(record.v_th, 5))
-    assert preflight(Inspected(both)) == "unconnected"
-
-
 def test_opposite_polarity_and_lags_out_of_reach_are_misaligned():
     record = simulate(periods=1.0)["damp"]
     assert Inspected(record.replace(v_out=-record.v_out)).correlated is None
@@ -88,17 +82,6 @@ def test_what_is_fitted_does_not_depend_on_whole_samples(late):
     assert not v_out[size:].any()
     assert padded.harmonics is not None
     np.testing.assert_array_equal(padded.harmonics.y, harmonic.y)
-
-
-def test_samples_have_harmonics_only_of_whole_periods():
-    """The score test of output error needs them; lanes without them need another program."""
-    whole = simulate()["dry"]
-    # From the first edge on. The joint of the periods, a third of a sample apart, is then steep.
-    cut = whole.replace(v_th=whole.v_th[1360:], v_out=whole.v_out[1360:])
-    one, other = (PaddedSamples.of(Inspected(record)) for record in (whole, cut))
-    assert one.harmonics is not None
-    assert other.harmonics is None
-    assert len(one.shapes) > len(other.shapes)
 
 
 def test_elements_are_those_without_the_delay(driver):
@@ -150,14 +133,3 @@ def test_a_joint_fit_aligns_its_recordings():
     assert (wrong < SIGMAS * np.asarray(found.fits.stderr.values())).all()
     remarks = np.asarray(found.fits.fit.remarks)
     np.testing.assert_array_equal(remarks, [0, 0, int(Remark.aligned), int(Remark.aligned)])
-
-
-@pytest.mark.slow
-def test_output_error_aligns_its_recordings():
-    records = simulate(30.2, seed=3, periods=1.5)
-    driver = etid.identify_driver(records["98k8"])
-    assert driver.method == "output_error"
-    for name in ("dry", "damp"):
-        fit = etid.identify_skin(records[name], driver)
-        wrong = np.abs(np.asarray(fit.circuit.values()) - dataclasses.astuple(LOADS[name]))
-        assert (wrong < SIGMAS * np.asarray(fit.stderr.values())).all()

@@ -13,7 +13,6 @@ import etid
 from benchmarks.specimens import study_fits
 from etid import cli
 from etid.commands import fit as fit_command
-from etid.estimators.registry import names
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import RESULTS, verdict, verdicts_of
 from etid.simulation.scenes import Scene, Trial
@@ -100,10 +99,12 @@ def calibrations():
     return {samples: list(study.calibrations.values()) for samples, study in scenes.items()}
 
 
-def assert_read(calibrations, method, count, path):
-    """Fit nonsense; what is written is read."""
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_fits_of_nonsense_are_read(calibrations, method, tmp_path):
+    of_driver, count = METHODS[method]
     records = calibrations[3334 if method == "output_error" else 10_000]
-    driver = etid.identify_driver(records, method=METHODS[method][0], throw=False)
+    driver = etid.identify_driver(records, method=of_driver, throw=False)
     rng = np.random.default_rng(count)
     v_th = records[0].samples["v_th"].values
     recordings = [
@@ -112,54 +113,30 @@ def assert_read(calibrations, method, count, path):
     ]
     fits = etid.identify_skins(recordings, driver, method=method)
     assert len(fits.counts()) >= 3  # nonsense fails in many ways
-    fits.write(path)
-    assert_equal(fits, etid.Fits.read(path))
+    fits.write(tmp_path / "fits.h5")
+    assert_equal(fits, etid.Fits.read(tmp_path / "fits.h5"))
 
 
-def test_every_method_fits_nonsense():
-    assert set(METHODS) == set(names())
-    assert sum(count for _, count in METHODS.values()) == 1000
-
-
-def test_fits_of_nonsense_are_read(calibrations, tmp_path):
-    assert_read(calibrations, "maximum_likelihood", 64, tmp_path / "fits.h5")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-def test_a_thousand_fits_of_nonsense_are_read(calibrations, method, tmp_path):
-    assert_read(calibrations, method, METHODS[method][1], tmp_path / "fits.h5")
-
-
-def test_whatever_is_written_is_read(tmp_path):
-    for seed in range(40):
-        outcome = drawn(seed)
-        outcome.write(tmp_path / "fits.h5")
-        again = StudyFits.read(tmp_path / "fits.h5")
-        assert_equal(outcome.fits, again.fits)
-        assert_equal(outcome.fits, etid.Fits.read(tmp_path / "fits.h5"))
-        for paths, driver in outcome.drivers.items():
-            for mine, read in zip(
-                *map(jax.tree.leaves, (driver, again.drivers[paths])), strict=True
-            ):
-                np.testing.assert_array_equal(mine, read)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_whatever_is_written_is_shown_and_exported_without_a_warning(tmp_path, seed):
-    again = drawn(seed)
-    again.write(tmp_path / "fits.h5")
+@pytest.mark.parametrize("seed", range(10))
+def test_whatever_is_written_is_read_shown_and_exported_without_a_warning(tmp_path, seed):
+    outcome = drawn(seed)
+    outcome.write(tmp_path / "fits.h5")
+    again = StudyFits.read(tmp_path / "fits.h5")
+    assert_equal(outcome.fits, again.fits)
+    for paths, driver in outcome.drivers.items():
+        both = map(jax.tree.leaves, (driver, again.drivers[paths]))
+        for mine, read in zip(*both, strict=True):
+            np.testing.assert_array_equal(mine, read)
     # `str` would show the fields of an object whose overview fails.
     assert max(map(len, again._overview().text().splitlines())) < 300
     for row in range(6):
         fit = again.fits[row]
         assert max(map(len, fit._overview().text().splitlines())) < 700  # a verdict is a sentence
         assert len(fit.elements) == len(fit.circuit.names())
-        assert fit.correlation.shape == (3, 3)
     assert set(again.fits.summary()[0]) > set(again.fits.circuit.names())
     fit_command._summary(again)
     cli._plain(fit_command._data(again))
     etid.export_fits(tmp_path / "fits.h5", tmp_path / "fits.csv")
     assert len((tmp_path / "fits.csv").read_text("utf-8").splitlines()) == 7
-    if seed < 3:
+    if seed < 2:
         etid.write_report(again, tmp_path / "page.html")

@@ -104,10 +104,6 @@ def test_a_class_in_place_of_its_instance_is_told_apart():
     )
 
 
-def test_an_order_of_numpy_is_an_order():
-    assert arguments.order_of(np.int64(5)) == 5
-
-
 @pytest.mark.parametrize("value", ["5 mA", None, [1.0, 2.0], 1j])
 def test_what_is_no_number_is_refused(value):
     with pytest.raises(etid.RecordingError, match=r"current_cap: is .*, must be a number\. Give"):

@@ -9,19 +9,12 @@ import numpy as np
 import pytest
 
 import etid
-from etid.estimators.lanes import PaddedSamples
-from etid.estimators.registry import OUTPUT_ERROR
-from etid.identify import fitting, planning
-from etid.identify.fitting import skin_lane
-from etid.identify.options import Options
-from etid.numpy_tier.tiers import program
-from etid.recordings.preflight import Inspected
+from etid.identify import fitting
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 LENGTH = 10_000
-PULSE = 3334  # samples of one period, which output error fits
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 TRUTH = np.array([33.4e3, 186e3, 0.12e-9])
 SIGMAS = 5.0  # one in 2 million for a normal error, which the coverage test measures
@@ -61,10 +54,6 @@ def fits(study, driver):
     return etid.identify_skins(study.loaded, driver)
 
 
-def cut(recording, size=PULSE):
-    return recording.replace(v_th=recording.v_th[:size], v_out=recording.v_out[:size])
-
-
 def rows(fits, paths):
     order = fits.labels["path"].tolist()
     return fits.take(np.array([order.index(path) for path in paths]))
@@ -73,26 +62,6 @@ def rows(fits, paths):
 def assert_same(one, other):
     for a, b in zip(jax.tree.leaves(one.fit), jax.tree.leaves(other.fit), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize(
-    ("fewest", "most", "taken"), [(3, 64, [5, 5, 5, 3]), (3, 4, [4, 4, 4, 4, 2])]
-)
-def test_many_short_recordings_are_read_at_once_and_few_long_ones(
-    study, driver, monkeypatch, fewest, most, taken
-):
-    """Five recordings have as many samples as are inspected together."""
-    records = list(study.loaded.recordings())
-    size = records[0].samples["v_out"].stored.size
-    for name, value in (("FEWEST", fewest), ("MOST", most), ("TOGETHER", 5 * size)):
-        monkeypatch.setattr(planning, name, value)
-    rows = iter(range(MANY))
-    found = [
-        planning.prepared(lambda row: (records[row], driver), rows, Options())
-        for _ in planning.calls(MANY)
-    ]
-    assert [len(part) for part in found if part] == taken
-    assert [row for part in found for row, _ in part] == list(range(MANY))
 
 
 def test_more_than_a_chunk_keeps_the_order(study, fits):
@@ -122,77 +91,8 @@ def test_a_bad_recording_changes_no_bit_of_its_neighbours(study, driver, fits, b
     assert_same(broken.take(others), rows(fits, np.array(paths)[others].tolist()))
 
 
-def test_a_recording_that_cannot_be_fitted_changes_no_bit_of_its_neighbours(study, driver, fits):
-    """It passes the pre-flight, so it sits in a lane beside the others and runs much longer."""
-    paths = list(study.loaded)[:6]
-    records = [study[path] for path in paths]
-    unrelated = np.roll(records[2].v_th, 3) * 0.5
-    records[2] = records[2].replace(v_out=unrelated, adc_range=None)
-    broken = etid.identify_skins(records, driver)
-    assert broken.verdicts[2] not in ("successful", "misaligned")
-    others = np.arange(6) != 2
-    assert_same(broken.take(others), rows(fits, np.array(paths)[others].tolist()))
-
-
-@pytest.mark.slow
-def test_lengths_and_rates_may_be_mixed(study, driver):
-    recording = cut(study["s01/dry/0"])
-    slow = simulate(samples=PULSE, sample_rate=150e3, seed=3)["s01/dry/0"].replace(path="slow")
-    short = cut(recording, 1500).replace(path="short")
-    fits = etid.identify_skins([short, recording, slow], driver)
-    assert fits.labels["path"].tolist() == ["short", "s01/dry/0", "slow"]
-    assert fits.counts() == {"successful": 3}
-    error = np.asarray(fits.circuit.values()) - TRUTH
-    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
-
-
-def test_ragged_lengths_fill_lanes_of_one_shape(study):
-    recording = study["s01/dry/0"]
-    lanes = [PaddedSamples.of(Inspected(cut(recording, n))) for n in range(2900, PULSE, 61)]
-    assert len({lane.shapes for lane in lanes}) == 1
-
-
-@pytest.mark.slow
-def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
-    traced = []
-
-    def counted(*arguments):
-        traced.append(arguments)
-        return skin_lane(*arguments)
-
-    monkeypatch.setattr(fitting, "skin_lane", counted)
-    records = [
-        cut(record, size)
-        for record, size in zip(study.loaded.recordings(), range(2900, PULSE, 13), strict=False)
-    ]
-    fits = etid.identify_skins(records, driver)
-    assert len({record.v_th.size for record in records}) == MANY
-    assert fits.fit.method == "output_error"
-    assert fits.counts() == {"successful": MANY}
-    error = np.asarray(fits.circuit.values()) - TRUTH
-    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
-    assert len(traced) <= 1  # none, if an earlier test has
-
-
-@pytest.mark.slow
-def test_what_fills_a_record_up_changes_no_digit(study, driver):
-    """The same samples in a longer lane."""
-    recording = cut(study["s01/dry/0"])
-    lane = jax.tree.map(jax.numpy.asarray, PaddedSamples.of(Inspected(recording)))
-    fitted = program(OUTPUT_ERROR.fit_load)
-    fit = fitted(lane, driver, None, etid.SkinRC())
-    v_th, v_out = (jax.numpy.pad(v, (0, 555)) for v in (lane.v_th, lane.v_out))
-    longer = dataclasses.replace(lane, v_th=v_th, v_out=v_out)
-    again = fitted(longer, driver, None, etid.SkinRC())
-    for one, other in zip(jax.tree.leaves(fit), jax.tree.leaves(again), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-5)  # of solvers that stop at 1e-3 errors
-
-
 def test_one_function_per_length_serves_all_drivers(study, driver, monkeypatch):
-    """A second driver, other recordings, another number of them, other typical values.
-
-    Nothing is traced again.
-    """
+    """A second driver, other recordings, another number of them, other typical values."""
     other = etid.identify_driver(simulate(seed=5)["calibration/0"])
     records = [study[path] for path in list(study.loaded)[:9]]
     etid.identify_skins(records, driver)
@@ -241,18 +141,6 @@ def test_a_calibration_that_is_none_is_named(study, named):
     result = etid.identify_study(etid.Study.from_recordings(records))
     assert result.fits.verdicts.tolist() == ["driver_failed", "successful"]
     assert named in result.fits.notes[0]
-
-
-def test_a_study_from_a_file_gives_the_same_bits(study, tmp_path):
-    part = etid.Study.from_recordings(
-        [study[path] for path in ("calibration/0", "s01/dry/0", "s01/dry/1")]
-    )
-    part.write(tmp_path / "study.h5")
-    with etid.read(tmp_path / "study.h5") as again:
-        from_file = etid.identify_study(again).fits
-    in_memory = etid.identify_study(part).fits
-    assert sorted(from_file.labels["path"]) == sorted(in_memory.labels["path"])
-    assert_same(from_file, rows(in_memory, from_file.labels["path"].tolist()))
 
 
 def test_progress_is_shown_only_on_request(study, driver, capsys):
@@ -318,11 +206,6 @@ def test_what_varies_is_the_spread_less_the_noise_of_all_recordings(mixed):
     assert row["r_p_shared"] == pytest.approx(0.02)
     # The variance of the spread is known to 2 %, three times what varies.
     assert row["r_p_between"] == pytest.approx(varies, rel=0.15)
-
-
-def test_labels_select(mixed):
-    assert mixed.where(subject="s02").labels["path"].tolist() == ["s01/dry/3"]
-    assert len(mixed.where(subject="s01", condition="damp")) == 0
 
 
 def test_failures_survive_a_file_with_units(mixed, tmp_path):

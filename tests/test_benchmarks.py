@@ -68,7 +68,7 @@ CASES = {
     "spectra": ("--spectra 4 --good 6 --seed 1", "", "wrong sign"),
     "which": ("--readme {}/README.md", "README.md", "| dry, 60 dB | **0.84** |"),
 }  # fmt: skip
-QUICK = ("design", "fuzz", "rivals", "referee", "which")
+QUICK = ("rivals", "referee", "which")
 # Run by `make ranking`, or with tests of their own; `speed` asserts that its peers agree.
 OWN = {"failure_map", "mutation", "scale", "speed", "speed_accuracy", "spice"}
 
@@ -161,7 +161,7 @@ def test_spice_scenes_are_fitted(reference_data, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_scale_measures_everything_and_a_killed_run_loses_nothing(tmp_path, monkeypatch):
-    """One layout and one kill: `test_benchmark_scenes` reads the others, `test_streaming` kills."""
+    """One layout and one kill: `test_benchmark_counts` reads the others, `test_streaming` kills."""
     monkeypatch.setattr(scale, "LAYOUTS", ("contiguous",))
     monkeypatch.setattr(scale, "KILLS", 1)
     plan = scale.Plan(tmp_path, 60, 6, ("equation_error",), "equation_error")

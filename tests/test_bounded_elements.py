@@ -12,7 +12,7 @@ import scipy.stats
 import etid
 from etid import cli
 from etid.circuits.display import quantity
-from etid.estimators.element_limits import _nearest, truncated, within
+from etid.estimators.element_limits import truncated, within
 from etid.estimators.judgement import SUCCESSFUL, judged
 from etid.recordings.remarks import Remark
 from etid.results.fit import Support
@@ -79,7 +79,7 @@ def test_several_bounded_elements_are_those_of_draws_inside_the_box():
     assert own.min() > 0
 
 
-@pytest.mark.parametrize("from_bound", [0.0, 0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("from_bound", [0.0, 1.0, 4.0])
 def test_intervals_contain_the_truth_as_often_as_they_say_near_and_far_from_a_bound(from_bound):
     """Between 94.2 and 97.3 % by quadrature; three standard deviations of 10 000 draws are 0.7."""
     truth, error = np.array([30e3, 180e3, 0.1e-9]), np.array([3e3, 3e3, 3e-12])
@@ -153,6 +153,7 @@ def test_draws_keep_to_the_bounds_and_agree_with_the_fit(free, beyond):
     assert beyond.intervals()["r_s"][0] == above(free, 1.0)
 
 
+@pytest.mark.slow
 def test_profiles_keep_to_the_bounds(free, beyond):
     bound = above(free, 1.0)
     own, other = beyond.profile("r_s"), beyond.profile("r_p")
@@ -171,25 +172,6 @@ def test_profiles_keep_to_the_bounds(free, beyond):
     np.testing.assert_allclose(ends, [middle, middle + 1.96 * error], rtol=0, atol=0.4 * error)
 
 
-@pytest.mark.slow
-def test_profiles_of_other_elements_keep_to_an_upper_bound(noisy, free):
-    """R_s may not be above its bound, so R_p, which has its sum with R_s, may hardly be below."""
-    bound = above(free, -1.0)
-    profile = etid.identify_skin(noisy, bounds={"r_s": (None, bound)}).profile("r_p")
-    cov = np.asarray(free.cov)
-    middle = float(free.circuit.r_p) + cov[0, 1] / cov[0, 0] * (bound - float(free.circuit.r_s))
-    error = np.sqrt(cov[1, 1] - cov[0, 1] ** 2 / cov[0, 0])
-    # That of a normal distribution of R_p at the bound of R_s, up to the skew at 20 dB.
-    low = profile.interval()[0]
-    np.testing.assert_allclose(low, middle - 1.96 * error, rtol=0, atol=0.4 * error)
-
-
-def test_an_element_that_the_data_hardly_know_has_the_error_of_its_prior(noisy, free):
-    width = 0.01 * float(free.stderr.r_s)
-    fit = etid.identify_skin(noisy, prior={"r_s": (float(free.circuit.r_s), width)})
-    np.testing.assert_allclose(fit.stderr.r_s, width, rtol=1e-3)
-
-
 def test_a_choice_compares_each_circuit_inside_its_own_bounds(noisy, free):
     """R_p of the true circuit is forbidden; another circuit has no such element."""
     candidates = [etid.SkinRC(), etid.Resistor()]
@@ -205,18 +187,6 @@ def test_a_choice_compares_each_circuit_inside_its_own_bounds(noisy, free):
     assert told.support is not None
     # The likeliest point inside is two standard errors away.
     np.testing.assert_allclose(told.support.deviance, 14.0, rtol=1e-6)
-
-
-def test_the_likeliest_point_inside_several_bounds_is_that_of_scipy():
-    related = np.array([[1, -0.9, 0.5], [-0.9, 1, -0.4], [0.5, -0.4, 1]])
-    low, high = np.array([1.0, 0.3, -2.0]), np.array([np.inf, 4.0, -0.5])
-    found = _nearest(jnp.asarray(related), jnp.asarray(low), jnp.asarray(high))
-    precision = np.linalg.inv(related)
-    ends = list(zip(low, high, strict=True))
-    best = scipy.optimize.minimize(
-        lambda x: x @ precision @ x, np.array([1.5, 1.0, -1.0]), bounds=ends, tol=1e-12
-    )
-    np.testing.assert_allclose(found, best.fun, rtol=1e-5)  # of SciPy's search
 
 
 @pytest.mark.slow
@@ -284,18 +254,3 @@ def test_bounds_in_time_and_at_several_amplitudes(noisy):
     )
     assert int(several.remarks) & Remark.at_bound
     assert several.circuit.r_s > lowest
-
-
-@pytest.mark.slow
-def test_intervals_of_bounded_fits_contain_the_truth():
-    """R_s known to a sixth, in the range of the paper; three deviations of 120 are 6 %."""
-    rng = np.random.default_rng(1)
-    truth = rng.uniform(19e3, 70e3, 120)
-    recordings = [
-        recorded(etid.SkinRC(r_s, 186e3, 0.12e-9), snr_db=14.0, seed=seed)
-        for seed, r_s in enumerate(truth)
-    ]
-    fits = etid.identify_skins(recordings, bounds={"r_s": (19e3, 70e3)})
-    covered = np.abs(np.asarray(fits.circuit.r_s) - truth) < 1.96 * np.asarray(fits.stderr.r_s)
-    assert covered.mean() > 0.89
-    assert (fits.verdicts == "successful").mean() > 0.98

@@ -38,12 +38,6 @@ def test_the_bound_is_that_of_the_spice_recordings(reference_data):
     assert compared > 500
 
 
-def test_three_times_the_samples_or_ten_decibels_less_noise_scale_every_error():
-    base = relative(bits=None)
-    np.testing.assert_allclose(relative(bits=None, samples=30_000), base / np.sqrt(3), rtol=1e-9)
-    np.testing.assert_allclose(relative(bits=None, snr_db=70.0), base / np.sqrt(10), rtol=1e-9)
-
-
 def test_what_is_known_makes_every_error_smaller():
     unknown = relative()
     assert (relative(delays=False) < unknown).all()
@@ -71,13 +65,6 @@ def test_the_bounds_of_a_scene_are_a_table():
     assert "<td" in (bounds._repr_html_() or "")
 
 
-def test_a_resistor_has_a_bound_too_in_ohm():
-    scene = Scene((Trial("a", ResistorLoad(55.2e3)),), KNOWN)
-    bound = etid.bound(scene)["a"]
-    assert bound.stderr["r"] == pytest.approx(bound.relative["r"] * 55.2e3)
-    assert 1e-5 < bound.relative["r"] < 1e-3
-
-
 def test_the_bound_of_a_resistor_from_its_current_has_a_closed_form():
     """Y = R I, both with noise: the information on ln R is 2 Σ |R I|² / (σ_Y² + R² σ_I²)."""
     r = 55.2e3
@@ -89,12 +76,6 @@ def test_the_bound_of_a_resistor_from_its_current_has_a_closed_form():
     inside = waveform.f < scene.sample_rate / 2
     information = 2 * scene.samples * np.sum(np.abs(r * current[inside]) ** 2) / noise
     assert found.relative["r"] == pytest.approx(information**-0.5, rel=INDEPENDENT)
-
-
-def test_a_current_and_a_driver_tell_more_than_each_alone():
-    both = relative(current_snr_db=40.0)
-    assert (both < relative()).all()
-    assert (both < relative(calibration=(), current_snr_db=40.0)).all()
 
 
 def test_a_fit_from_a_current_has_the_errors_of_the_bound():

@@ -12,7 +12,6 @@ import etid
 from benchmarks.ladder import rung
 from etid import cli
 from etid.circuits import lookup
-from etid.commands import fit as command
 from etid.simulation.scenes import Trial
 
 DONE, WRONG_DATA, WRONG_USAGE = 0, 1, 2
@@ -58,20 +57,6 @@ def files(folder, monkeypatch):
     return folder
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("SkinCurrent", "depends on its current.* call etid.identify_amplitudes"),
-        ("skinrc", "there is no circuit 'skinrc' in etid; did you mean SkinRC\\? Or use one of"),
-        ("SkinCol", "did you mean SkinCole\\?"),
-        ("Battery", "there is no circuit 'Battery' in etid; use one of ParallelRC, "),
-    ],
-)
-def test_an_unknown_circuit_is_told_the_near_one_or_who_fits_it(name, words):
-    with pytest.raises(ValueError, match=words):
-        lookup.imported(name)
-
-
 def test_the_command_fits_a_circuit_of_ones_own(files):
     fits = etid.Fits.read("fits.h5")
     assert type(fits.circuit).__module__ == "lab_skins"
@@ -96,23 +81,6 @@ def test_its_fits_are_reported_and_exported(files):
     for name, start in starts.items():
         assert cli.main(["export", "fits.h5", "-o", name, *chosen]) == DONE
         assert (files / name).read_text("utf-8").startswith(start)
-
-
-@pytest.mark.parametrize("options", [(), ("--joint",)])
-def test_the_command_passes_a_circuit_of_etid_on(files, options, monkeypatch, tmp_path):
-    asked = {}
-
-    def fitted(*_, circuit, **__):
-        asked["circuit"] = circuit
-        return etid.StudyFits.read("fits.h5")
-
-    monkeypatch.setattr(command, "identify_jointly" if options else "fit_file", fitted)
-    target = str(tmp_path / "new.h5")
-    options = (*options, "--force")
-    assert cli.main(["fit", "study.h5", "-o", target, "--circuit", "SkinCole", *options]) == DONE
-    assert type(asked["circuit"]) is etid.SkinCole
-    assert cli.main(["fit", "study.h5", "-o", target, "--circuit", "auto", *options]) == DONE
-    assert asked["circuit"] == "auto"
 
 
 def test_a_file_imports_nothing_and_says_what_to_import(files, tmp_path, capsys, monkeypatch):
@@ -150,19 +118,6 @@ def test_an_unknown_circuit_is_one_error(files, tmp_path, stored, says):
         content.attrs["circuit"] = stored
     with pytest.raises(etid.RecordingError, match=rf"fits\.h5, circuit: .*{says}"):
         etid.Fits.read(other)
-
-
-def test_a_circuit_that_has_changed_is_refused(files, tmp_path):
-    class Spread(etid.AbstractCircuit):
-        outer: float = etid.parameter("ohm", typical=1.0)
-
-        def impedance(self):
-            return etid.resistor(self.outer)
-
-    with pytest.raises(etid.RecordingError, match=r"Spread has outer\. Pass the class as it was"):
-        etid.Fits.read("fits.h5", Spread)
-    with pytest.raises(etid.RecordingError, match="that was passed is SkinRC: pass Spread"):
-        etid.Fits.read("fits.h5", etid.SkinRC)
 
 
 @pytest.mark.parametrize(

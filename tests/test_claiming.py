@@ -104,11 +104,3 @@ def test_a_file_system_without_locks_refuses_nobody(tmp_path, monkeypatch):
     monkeypatch.setattr(replacing.fcntl, "flock", missing)
     with claimed(tmp_path / "fits.h5"), claimed(tmp_path / "fits.h5"):
         pass
-
-
-def test_a_folder_that_cannot_be_written_is_an_error_before_the_work(tmp_path):
-    with (
-        pytest.raises(etid.RecordingError, match=r"fits.h5: cannot be written"),
-        claimed(tmp_path / "missing" / "fits.h5"),
-    ):
-        pass

@@ -56,12 +56,6 @@ def test_a_pulse_whose_top_is_cut_by_5_percent_is_clipped(waves, bits, snr_db):
             assert is_clipped(-converted(v, bits, sigma, number, (-np.inf, 0.95 * top)), 0.0)
 
 
-def test_a_converter_without_negative_voltages_clips_the_undershoot(waves):
-    for number, (volts, at_0_db) in enumerate(waves):
-        for v in volts:
-            assert is_clipped(converted(v, 16, 1e-3 * at_0_db, number, (0.0, np.inf)), 0.0)
-
-
 @pytest.mark.parametrize("width", [1, 9])
 def test_commands_of_a_generator_are_not_clipped(width):
     phase = np.arange(SAMPLES) * 60.0 / RATE % 1

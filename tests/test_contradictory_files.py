@@ -9,7 +9,7 @@ import scipy.io.wavfile
 
 import etid
 from tests import lab_files
-from tests.lab_files import LINE, rig
+from tests.lab_files import LINE, rig, table
 
 COUNT = 30
 V_TH = np.round(np.random.default_rng(8).normal(size=COUNT), 3)
@@ -28,12 +28,6 @@ def refused(path, message, **given):
     assert lab_files.refused(path, None, message, **{**GIVEN, **given}).remedy
 
 
-def table(path, text):
-    file = path / "a.csv"
-    file.write_text(text, encoding="utf-8")
-    return file
-
-
 def rows(sign=".", between=",", end=""):
     """Times, V_th and V_out in text."""
     lines = [
@@ -46,16 +40,6 @@ def rows(sign=".", between=",", end=""):
 # Tables
 
 
-def test_two_columns_of_a_workbook_with_one_name_are_not_chosen_from(tmp_path):
-    openpyxl = pytest.importorskip("openpyxl")
-    book = openpyxl.Workbook()
-    book.active.append(["open", "skin", "skin [mV]"])
-    for a, b in zip(V_TH, V_OUT, strict=True):
-        book.active.append([float(a), float(b), 0.0])
-    book.save(tmp_path / "a.xlsx")
-    refused(tmp_path / "a.xlsx", "v_out: two channels have the name 'skin'", **RATE)
-
-
 @pytest.mark.parametrize("cell", ["1.234", "-12.345.678", "0.5"])
 def test_a_point_is_no_decimal_sign_beside_decimal_commas(cell, tmp_path):
     lines = rows(",", ";")
@@ -63,14 +47,6 @@ def test_a_point_is_no_decimal_sign_beside_decimal_commas(cell, tmp_path):
     path = table(tmp_path, "t [s];open;skin\n" + "".join(lines))
     told = {"delimiter": ";", "decimal": ","}
     refused(path, f"line 9 has the cell '{cell}', but the decimal sign is a comma", **told, **RATE)
-
-
-def test_points_in_columns_that_are_not_asked_for_change_nothing(tmp_path):
-    dated = "".join(f"12.03.2024;{line}" for line in rows(",", ";"))
-    path = table(tmp_path, f"date;t [s];open;skin\n{dated}")
-    one, notices = imported(path, time="t", delimiter=";", decimal=",")
-    np.testing.assert_array_equal(one.v_th, V_TH)
-    assert notices == ()
 
 
 @pytest.mark.parametrize(
@@ -82,13 +58,6 @@ def test_a_row_whose_cells_are_shifted_is_named(row, cells, end, tmp_path):
     lines[20] = row + "\n"
     path = table(tmp_path, f"t,open,skin{end}\n" + "".join(lines))
     refused(path, f"line 22 has {cells} cells; the table has", **RATE)
-
-
-def test_a_cell_that_the_rows_lost_in_the_middle_is_no_other_cell(tmp_path):
-    lines = [line[:-1] + ",37.0\n" for line in rows()]
-    lines[4] = lines[4].partition(",")[2]  # what is left of it are three numbers
-    path = table(tmp_path, "t,open,skin,temperature\n" + "".join(lines))
-    refused(path, "line 6 has 3 cells; the table has 4 columns, and numbers in 4", **RATE)
 
 
 def test_notes_quotes_and_delimiters_at_the_end_are_no_fault(tmp_path):
@@ -135,14 +104,6 @@ def test_the_preamble_of_an_oscilloscope_is_compared_with_its_table(tmp_path):
     assert str(used).endswith(f"\n  note: {notice}")
     tmp_path.joinpath("a.h5").unlink()
     refused(scope(30, "1e-05"), "is 200000 Hz from the time 't', but 100000 Hz from the f", **told)
-
-
-def test_two_units_of_one_column_are_not_chosen_from(tmp_path):
-    path = table(tmp_path, "open [mV],skin [mV]\nmV,V\n" + "1,2\n3,4\n")
-    refused(path, "the file says 'mV' and 'V' of channel 'skin'", **RATE)
-    path = table(tmp_path, "open [mV],skin (V)\n(millivolts),\n" + "1,2\n3,4\n")
-    one, _ = imported(path, **RATE)  # two spellings of one unit
-    np.testing.assert_allclose(one.v_th, [1e-3, 3e-3])
 
 
 # Other formats
@@ -220,31 +181,3 @@ def test_a_scaling_that_leaves_no_samples_is_refused(kind, tmp_path):
         refused(path, "v_out: channel 'rig/skin' is scaled with slope", **RIG)
     one, _ = imported(rig(tmp_path, V_TH, codes, **LINE), **RIG)
     np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * np.arange(COUNT), rtol=1e-15)
-
-
-@pytest.mark.parametrize("kind", ["i2", "f4", "f8"])
-def test_a_scaling_that_is_no_line_is_applied(kind, tmp_path):
-    square = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Polynomial",
-              "NI_Scale[0]_Polynomial_Coefficients_Size": 3,
-              **{f"NI_Scale[0]_Polynomial_Coefficients[{i}]": c
-                 for i, c in enumerate((0.5, 2e-3, 1e-7))}}  # fmt: skip
-    one, _ = imported(rig(tmp_path, V_TH, np.arange(COUNT).astype(kind), **square), **RIG)
-    n = np.arange(COUNT)
-    np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * n + 1e-7 * n**2, rtol=1e-14)
-
-
-def test_two_units_of_a_tdms_channel_are_not_chosen_from(tmp_path):
-    said = "v_out: the file says 'V' and 'mV' of channel 'rig/skin'"
-    refused(rig(tmp_path, V_TH, V_OUT, NI_UnitDescription="mV"), said, **RIG)
-    one, _ = imported(rig(tmp_path, V_TH, V_OUT, NI_UnitDescription="Volts"), **RIG)
-    np.testing.assert_array_equal(one.v_out, V_OUT)
-
-
-def test_the_steps_of_a_tdms_channel_have_a_unit(tmp_path):
-    refused(
-        rig(tmp_path, V_TH, V_OUT, wf_xunit_string="Hz"),
-        "a sample every 5e-06 'Hz', which is not a",
-        **RIG,
-    )
-    path = rig(tmp_path, V_TH, V_OUT, wf_increment=5.0, wf_xunit_string="us")
-    assert imported(path, **RIG)[0].sample_rate == pytest.approx(200e3, rel=1e-12)

@@ -87,30 +87,6 @@ def test_the_standard_error_of_the_charge_is_what_other_calibrations_and_noise_m
     np.testing.assert_allclose(one.charge_stderr, jnp.abs(shift), rtol=1e-9)
 
 
-def test_no_skin_carries_more_than_the_guard_lets_a_short_circuit_carry():
-    """Skins over many decades, from the circuit of the transformer itself."""
-    controller, _ = controlled(current_cap=4e-3)
-    rng = np.random.default_rng(3)
-    for _ in range(40):
-        logs = rng.uniform(np.log([1.0, 10.0, 1e-11]), np.log([1e5, 1e6, 1e-7]))
-        peak = np.abs(true_current(SkinLoad(*np.exp(logs)))).max()
-        assert float(controller.limits.guard) * peak <= 4e-3
-
-
-def test_a_transformer_with_exchanged_ends_changes_no_limit():
-    """All voltages change their sign, and so does the largest current through a short circuit."""
-    controller, state = controlled(charge_cap=120e-9)
-    model = controller.tracker.model
-    bands = dataclasses.replace(model.bands, x=-model.bands.x)
-    tracker = dataclasses.replace(controller.tracker, model=dataclasses.replace(model, bands=bands))
-    turned = etid.Controller.of(tracker, charge_cap=120e-9)
-    for one, other in zip(controller.limits, turned.limits, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12)
-    assert turned.short == pytest.approx(controller.short, rel=1e-12)
-    before, after = (of.command(state, charge=80e-9) for of in (controller, turned))
-    np.testing.assert_allclose(before.amplitude, after.amplitude, rtol=1e-12)
-
-
 @pytest.mark.parametrize("cap", [20e-9, 120e-9])
 def test_the_fallback_is_what_a_short_circuit_may_carry_or_is_refused(cap):
     """The charge through a short circuit is that of the circuit of the transformer itself."""
@@ -168,26 +144,6 @@ def test_limits_hold_and_are_named(limits, reason):
     assert (command.amplitude * peaks <= limits.get("current_cap", np.inf)).all()
     # The caps on what is delivered hold with a margin of k standard errors.
     assert (command.charge < limits.get("charge_cap", np.inf)).all()
-
-
-def test_the_cap_of_the_estimate_holds_as_often_as_it_should():
-    """Of estimates that scatter as their standard errors say; the true peak is that of the mean."""
-    controller, state = controlled(charge_cap=50e-9, probability=0.9)
-    draws, rng = 300, np.random.default_rng(5)
-    logs = state.electrodes.own[1, :3]
-    cov = np.linalg.inv(np.asarray(state.electrodes.information[1]))
-    model = controller.model
-    model = dataclasses.replace(model, source_error=0 * model.source_error)
-    circuit = controller.tracker.model.circuit
-    true = float(eqx.filter_jit(model.current)(circuit, logs, jnp.zeros((3, 3))).charge)
-    drawn = np.asarray(logs)[None, :] + rng.standard_normal((draws, 3)) @ np.linalg.cholesky(cov).T
-    found = eqx.filter_jit(jax.vmap(lambda one: model.current(circuit, one, jnp.asarray(cov))))(
-        drawn
-    )
-    amplitude = 50e-9 / (found.charge + controller.limits.quantile * found.charge_stderr)
-    share = float(np.mean(np.asarray(amplitude) * true > 50e-9))
-    # Three standard deviations of a binomial share.
-    assert abs(share - 0.1) < 3 * np.sqrt(0.09 / draws), share
 
 
 def test_an_electrode_that_is_not_good_gets_the_fallback_and_says_so():

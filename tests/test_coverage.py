@@ -1,19 +1,13 @@
 """Monte Carlo: the intervals contain the truth as often as they say."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import scipy.stats
 
 import etid
-from benchmarks.amplitude_errors import draws, smallest_errors
 from benchmarks.coverage import monte_carlo, scene
 from benchmarks.estimators import Drivers
-from benchmarks.failure_axes import cells
-from benchmarks.failure_draws import Effort, answers
 from benchmarks.ladder import LOADS
-from benchmarks.rates import NORMAL_95
 
 SUCCESSFUL = 0.9
 # Limits are those within which numbers of a normal error are in 997 of 1000 sets of draws. Errors
@@ -97,45 +91,3 @@ def assert_honest(draws, repetitions):
         assert (np.abs(of.z.mean(0)) < max(BIAS, 3 / np.sqrt(good))).all(), of.z.mean(0)
         most = scipy.stats.chi2.interval(SURE, of.error.shape[1] * good)[1]
         assert of.distance.sum() < most, of.distance.sum() / (of.error.shape[1] * good)
-
-
-@pytest.mark.slow
-def test_a_driver_has_no_section_that_noise_has_split():
-    """One of 200 calibrations: of two minima the one with two sections in one place was taken.
-
-    Its standard errors were too small, and C_p of dry skin 6.4 of them off, called successful.
-    """
-    study = scene(60.0, 10_000, jitter=0.0).simulate(seed=5041)
-    driver = etid.identify_driver(list(study.calibrations.recordings()))
-    fit = etid.identify_skin(study["dry"], driver)
-    error = np.asarray(fit.circuit.values()) - dataclasses.astuple(LOADS["dry"])
-    # One draw that was looked for, of 600 errors: 4 in one of 30 sets of them.
-    assert (np.abs(error) < 4 * np.asarray(fit.stderr.values())).all()
-
-
-@pytest.mark.slow
-def test_a_resistor_fitted_to_skin_is_refused_at_20_db():
-    """It was called successful in 158 of 160 fits."""
-    place = ("SNR and circuit fitted to skin", "20 dB", "resistor")
-    [cell] = [cell for cell in cells() if tuple(cell.place.values()) == place]
-    found = answers(cell, {"default": Effort(2, 10), "steiglitz_mcbride": Effort(2, 10)})
-    assert len(found) == 20  # the other method knows skin only
-    assert sum(of.successful for of in found) <= 1  # one of 80 was
-    assert not any(of.exact for of in found)
-
-
-@pytest.mark.slow
-def test_intervals_of_three_amplitudes_are_right_and_near_the_bound():
-    """Without the last step, R_s and I_0 had 1.70 and 1.56 times the smallest errors."""
-    amplitudes = (1e-3, 3e-3, 5e-3)
-    # `test_amplitudes` compares more errors of these amplitudes with what the fits state.
-    found = draws(amplitudes, 60.0, 12)
-    assert (found.verdicts == "successful").all()
-    # Each is outside of these limits once in a thousand times.
-    right, ratio = (np.abs(found.z) < NORMAL_95).sum(0), np.sqrt(np.mean(found.z**2, axis=0))
-    assert np.all(right >= 8), right
-    assert np.all((ratio > 0.40) & (ratio < 1.70)), ratio
-    # A record of 332 terms knows its noise to 8 % of the power. More than expected counts, less
-    # does not, so the standard errors are 3 % larger on average. Conjugate gradients add 1 %.
-    stated = np.sqrt(np.mean(found.stderr**2, axis=0)) / smallest_errors(amplitudes, 60.0)
-    assert np.all((stated > 0.97) & (stated < 1.1)), stated

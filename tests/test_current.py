@@ -6,18 +6,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.io
 
 import etid
 from etid import cli
-from etid.identify import file as fit_file
-from etid.plotting import figure_of
 from etid.recordings.causes import why_misaligned
 from etid.recordings.preflight import Inspected, preflight
-from etid.results.feed import MEASURED_CURRENT
-from etid.simulation.transformer import Sampler
 from tests import kept_numbers
-from tests.conftest import REFERENCE_DATA
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
@@ -69,15 +63,6 @@ def test_a_load_is_identified_from_whole_periods_of_current_and_voltage(skin):
 
 
 @pytest.mark.slow
-def test_a_constant_phase_is_identified_and_chosen():
-    recording = recorded(COLE)
-    selection = etid.select_circuit(recording)
-    assert all(axes.has_data() for axes in figure_of(selection, recording).axes)
-    assert type(selection.fit.circuit) is etid.SkinCole
-    assert np.abs(off(selection.fit, COLE)).max() < WITHIN
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("periods", [3.0, 1.1])
 def test_a_fixed_element_keeps_its_value_and_helps_the_others(skin, periods):
     recording = skin if periods == 3.0 else recorded(SKIN, periods=periods)
@@ -109,29 +94,6 @@ def test_a_single_pulse_is_identified_in_time():
     assert fit.method == "output_error"
     assert np.abs(off(fit, SKIN)).max() < WITHIN
     kept_numbers.check("current_in_time", kept_numbers.of_fit(fit))
-
-
-def test_edges_that_the_sample_rate_does_not_resolve_are_said():
-    """R_s was 0.9 % off, six standard errors, and successful."""
-    sampler = Sampler(RATE, PULSES, 0.4 * RATE)  # its anti-alias filter leaves aliases of steps
-    f = sampler.f
-    first, second, end = (np.exp(-2j * np.pi * f * (0.5e-3 + k * WIDTH)) for k in range(3))
-    x = STRENGTH * PULSES * (first - 2 * second + end) / (2j * np.pi * f)
-    both = (
-        sampler.sample(of, 3700, 0.0) for of in (x, x * np.asarray(SKIN.response(jnp.asarray(f))))
-    )
-    rng = np.random.default_rng(0)
-    current, v_out = (v + 1e-3 * np.std(v) * rng.standard_normal(v.size) for v in both)
-    recording = etid.Recording(current=current, v_out=v_out, sample_rate=RATE, pulse_rate=PULSES)
-    assert etid.identify_skin(recording, throw=False).verdict == "biased"
-
-
-@pytest.mark.slow
-def test_a_single_pulse_on_a_constant_phase_is_identified_and_chosen_in_time():
-    selection = etid.select_circuit(recorded(COLE, periods=1.1, snr_db=50))
-    assert selection.fit.method == "output_error"
-    assert type(selection.fit.circuit) is etid.SkinCole
-    assert np.abs(off(selection.fit, COLE)).max() < WITHIN
 
 
 @pytest.mark.parametrize(
@@ -166,12 +128,6 @@ def test_a_prediction_from_the_current_misses_by_the_noise(skin):
     assert np.nanstd(rest) < 2e-3 * np.std(skin.v_out)
     cole = recorded(COLE, periods=1.1)
     assert np.nanstd(etid.predict(cole, circuit=COLE) - cole.v_out) < 2e-3 * np.std(cole.v_out)
-
-
-@pytest.mark.parametrize("show", ["pulse", "impedance", "residual"])
-def test_a_fit_from_a_current_is_drawn(skin, show):
-    figure = figure_of(etid.identify_skin(skin), skin, show=show)
-    assert all(axes.has_data() for axes in figure.axes)
 
 
 def test_a_study_of_currents_needs_no_calibration_and_its_report_speaks_of_no_driver(
@@ -222,56 +178,6 @@ def test_draws_of_a_fit_with_known_elements_keep_to_them(skin):
         fit.profile("r_s")
 
 
-def test_a_choice_among_circuits_takes_elements_that_all_of_them_have(skin):
-    few = [etid.SkinRC(), etid.SkinCole()]
-    selection = etid.select_circuit(skin, candidates=few, fixed={"r_s": 33e3})
-    np.testing.assert_allclose(selection.fit.circuit.r_s, 33e3, rtol=1e-8)
-
-
-def test_a_run_with_other_known_elements_is_not_resumed(skin, tmp_path, monkeypatch):
-    source, target = tmp_path / "study.h5", tmp_path / "fits.h5"
-    etid.Study.from_recordings([skin.replace(path="s01/0")]).write(source)
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(fit_file, "_fit", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            etid.fit_file(source, target, **KNOWN)
-    with pytest.raises(fit_file.ResumeError, match="another fixed"):
-        etid.fit_file(source, target, fixed={"r_s": 34e3}, prior=KNOWN["prior"], resume=True)
-    with pytest.raises(fit_file.ResumeError, match="another prior"):
-        etid.fit_file(source, target, fixed=KNOWN["fixed"], resume=True)
-    found = etid.fit_file(source, target, **KNOWN, resume=True)
-    settings = etid.StudyFits.read(target).settings
-    assert settings is not None
-    assert (found.settings, settings.fixed) == (settings, ("r_s 33000.0",))
-    assert settings.prior == ("c_p 1.2e-10 ± 1e-13",)
-
-
-def test_a_joint_fit_leaves_recordings_of_a_current_to_fits_of_their_own(skin):
-    joint = etid.identify_jointly(etid.Study.from_recordings([skin.replace(path="s01/0")]))
-    fit, alone = joint.fits[0], etid.identify_skin(skin)
-    assert (joint.drivers, fit.verdict, fit.method) == ({}, "successful", "joint")
-    np.testing.assert_allclose(fit.circuit.values(), alone.circuit.values(), rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_one_load_is_identified_from_several_recordings_of_its_current(skin):
-    several = [skin, *(recorded(SKIN, seed=seed, delay=seed * 1e-6) for seed in (1, 2, 3))]
-    fit = etid.identify_amplitudes(several, circuit=etid.SkinRC())
-    assert np.abs(off(fit, SKIN)).max() < WITHIN
-    known = etid.identify_amplitudes(several, circuit=etid.SkinRC(), **KNOWN)
-    np.testing.assert_allclose(known.circuit.r_s, 33e3, rtol=1e-8)
-    assert known.stderr.c_p < 1e-13
-    assert known.stderr.r_p < 0.95 * fit.stderr.r_p
-    assert np.abs(off(known, SKIN))[1:].max() < WITHIN
-    alone = etid.identify_skin(skin)
-    # Four recordings with equal noise, whose level is estimated to a few per cent.
-    np.testing.assert_allclose(fit.stderr.r_p, alone.stderr.r_p / 2, rtol=0.1)
-
-
 def test_known_elements_on_the_command_line(skin, tmp_path, capsys):
     study = tmp_path / "study.h5"
     etid.Study.from_recordings([skin.replace(path="s01/0")]).write(study)
@@ -294,13 +200,6 @@ def test_known_elements_on_the_command_line(skin, tmp_path, capsys):
     with pytest.raises(SystemExit):
         cli.main([*command, "--prior", "r_s=much"])
     assert "write --fix r_s=500 or --prior r_s=500,50" in capsys.readouterr().err
-
-
-def test_without_a_driver_the_unloaded_voltage_is_not_used(skin):
-    both = skin.replace(v_th=np.zeros_like(skin.v_out))
-    np.testing.assert_array_equal(
-        etid.identify_skin(both).circuit.values(), etid.identify_skin(skin).circuit.values()
-    )
 
 
 @pytest.mark.parametrize(
@@ -350,57 +249,9 @@ def test_a_late_capacitor_is_not_mistaken_for_a_wrong_sign(late):
     assert why_misaligned(seen).startswith("The cause is not clear")
 
 
-def test_a_measured_current_prints_itself():
-    assert repr(MEASURED_CURRENT) == "Measured current"
-
-
-def test_a_current_that_its_source_holds_is_not_clipped(skin):
-    phase = skin.time % (1 / PULSES)
-    held = np.where((phase > 1e-3) & (phase < 2e-3), STRENGTH, 0.0)
-    assert preflight(Inspected(skin.replace(current=held, v_out=1e4 * held + skin.v_out))) is None
-
-
 def test_a_current_that_its_converter_clips_is_refused(skin):
     clipped = skin.replace(current=np.minimum(skin.current, 0.8 * skin.current.max()))
     for record, verdict in ((skin, None), (clipped, "saturated")):
         assert preflight(Inspected(record)) == verdict
         ranged = record.replace(adc_range=(-1e4, 1e4))  # that of the voltages
         assert preflight(Inspected(ranged)) == verdict
-
-
-ECOG = REFERENCE_DATA / "ecog_stim" / "20f8a3_stimOutput.mat"
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not ECOG.exists(), reason="reference data are not here")
-def test_electrodes_on_tissue_have_a_constant_phase_and_a_misfit():
-    """Platinum electrodes, 500 µA in each direction, as commanded.
-
-    The voltage jumps where the current does. The commanded 1.2 ms are 29.3 samples, but each phase
-    lasts 29. A current of 30 and 29 samples, which the command suggests, leaves 7 to 9 %.
-    """
-    rate, rest = 24414.0625, 40  # `rest` samples before the pulse replace the pause
-    found = scipy.io.loadmat(ECOG, squeeze_me=True, struct_as_record=False)["dataStruct"]
-    for name in found._fieldnames[:2]:  # of five alike, each of which takes seconds
-        pair = getattr(found, name)
-        mean = pair.stim_data.mean(1)
-        start, middle, end = np.sort(np.argsort(np.abs(np.diff(mean)))[-3:]) + 1 + rest
-        assert middle - start == end - middle == 29
-        v_out = np.concatenate([np.full(rest, mean[:18].mean()), mean])
-        current = np.zeros(v_out.size)
-        current[start:middle], current[middle:end] = (
-            sign * pair.stim_current * 1e-6 for sign in (1, -1)
-        )
-        recording = etid.Recording(
-            v_out=v_out, current=current, sample_rate=rate, pulse_rate=rate / v_out.size
-        )
-        selection = etid.select_circuit(
-            recording,
-            candidates=[etid.SkinRC(), etid.SkinCole()],
-            method="output_error",
-            throw=False,
-        )
-        assert type(selection.fit.circuit) is etid.SkinCole
-        assert selection.fit.verdict == "misfit"
-        # Others found 0.7 to 1.4 % in three of the pairs, without the samples at the edges.
-        assert selection.fit.rrse < 0.017

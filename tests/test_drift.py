@@ -1,7 +1,6 @@
 """Drivers whose Z_th drifts after the calibration: standard errors that hold it are true."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 import etid
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
-from etid.results.driver import ContinuousDriver, SourceImpedance
+from etid.results.driver import SourceImpedance
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver, loading
 
@@ -70,10 +69,7 @@ def test_standard_errors_hold_what_the_driver_drifts_by(driver, method):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LOADS)
 def test_standard_errors_hold_what_the_parts_of_the_driver_drift_by(driver, name):
-    """A part changes several parameters of Z_th together, which the drift takes as independent.
-
-    To first order, errors of R_p are 1.2 of their standard errors then, those of R_s 0.9 to 1.0.
-    """
+    """A part changes several parameters of Z_th together, which the drift takes as independent."""
     recordings = []
     for number in range(DRIVERS):
         later = drawn_driver(number, DRIFT, TransformerDriver())
@@ -141,22 +137,3 @@ def recorded_skin():
 def recorded_calibration():
     known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
     return Scene((), known).simulate(seed=1)["calibration/0"]
-
-
-@pytest.mark.slow
-def test_a_study_and_its_file_pass_the_drift_on(tmp_path):
-    trials = (Trial("loaded/0", DRY),)
-    known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
-    study = Scene(trials, known, samples=10_000).simulate(seed=1)
-    study.write(tmp_path / "study.h5")
-    options: dict[str, Any] = {"order": 5, "driver_drift": DRIFT}
-    found = [
-        etid.identify_study(study, **options),
-        etid.fit_file(tmp_path / "study.h5", tmp_path / "fits.h5", **options),
-    ]
-    for one in (*found, etid.StudyFits.read(tmp_path / "fits.h5")):
-        assert one.settings is not None
-        assert one.settings.driver_drift == DRIFT
-        (driver,) = one.drivers.values()
-        assert isinstance(driver, ContinuousDriver)
-        assert driver.drift == DRIFT

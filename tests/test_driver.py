@@ -2,9 +2,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from jax.flatten_util import ravel_pytree
 
 from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
 from etid.circuits.impedance import realise
@@ -60,32 +57,6 @@ def test_source_impedance_is_its_formula():
     assert SOURCE.order == 5
 
 
-def test_slopes_of_the_impedance_are_its_derivatives():
-    vector, unflatten = ravel_pytree(SOURCE)
-    slopes = jax.jit(jax.jacfwd(lambda p: unflatten(p).response(FREQUENCY)))
-    expected = np.asarray(slopes(vector)).T
-    found = np.asarray(jax.jit(SourceImpedance.slopes)(SOURCE, FREQUENCY))
-    scale = np.abs(expected).max(axis=1, keepdims=True)
-    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-12)
-
-
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
-def test_response_keeps_the_shape_of_the_frequencies(shape):
-    frequency = jnp.full(shape, 1e4)
-    z = respond(SOURCE, frequency)
-    assert z.shape == shape
-    np.testing.assert_allclose(z, respond(SOURCE, jnp.array(1e4)), rtol=1e-13)
-
-
-@settings(max_examples=20)
-@given(st.lists(st.floats(-3, 3), min_size=11, max_size=11))
-def test_every_value_of_the_parameters_is_stable(shifts):
-    vector, unflatten = ravel_pytree(SOURCE)
-    source = unflatten(vector + jnp.asarray(shifts))
-    poles = np.linalg.eigvals(np.asarray(source.state_space().A))
-    assert poles.real.max() < 0
-
-
 def one_section(log_zeta):
     none = jnp.zeros(0)
     one, half = jnp.ones(1), jnp.full(1, 0.5)
@@ -109,33 +80,6 @@ def test_realisations_have_the_right_response(name):
     np.testing.assert_allclose(transfer_of(system), expected, rtol=10 * SOLVED)
     # A passive driver and a passive load cannot oscillate.
     assert np.linalg.eigvals(np.asarray(system.A)).real.max() < 0
-
-
-def test_realisation_equals_its_polynomials():
-    num, den = np.asarray(LAYERS.num)[::-1], np.asarray(LAYERS.den)[::-1]
-    expected = np.polyval(num, S) / np.polyval(den, S)
-    np.testing.assert_allclose(transfer_of(realise(LAYERS, RATE)), expected, rtol=SOLVED)
-
-
-@pytest.mark.parametrize("rate", [1e3, 1e7])
-def test_the_scaling_rate_changes_no_impedance(rate):
-    expected = transfer_of(loaded(SOURCE, LAYERS, RATE))
-    np.testing.assert_allclose(transfer_of(loaded(SOURCE, LAYERS, rate)), expected, rtol=1e-6)
-
-
-def test_only_ratios_to_the_source_are_observable():
-    larger = SourceImpedance(
-        SOURCE.log_resistance + jnp.log(3.0),
-        SOURCE.log_omega,
-        SOURCE.log_zeta,
-        3 * SOURCE.gain,
-        3 * SOURCE.slope,
-        SOURCE.log_omega_real,
-        3 * SOURCE.gain_real,
-    )
-    load = SkinRC(3 * 33.4e3, 3 * 186e3, 0.12e-9 / 3).impedance().rational()
-    expected = transfer_of(loaded(SOURCE, LOADS["skin"], RATE))
-    np.testing.assert_allclose(transfer_of(loaded(larger, load, RATE)), expected, rtol=SOLVED)
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,12 @@
 """Loads identified from V_th, V_out and the current at once, with a driver."""
 
-import dataclasses
-from typing import Any
-
 import numpy as np
 import pytest
 
 import etid
 from etid.recordings.remarks import Remark
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, TransformerDriver
+from etid.simulation.transformer import ResistorLoad
 
 SKIN = etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 METHOD = "maximum_likelihood(with_current=True)"
@@ -106,14 +103,6 @@ def test_a_current_that_contradicts_the_driver_is_never_averaged(
     assert fit.verdict in verdicts
 
 
-def test_a_driver_that_has_changed_is_told(driver, both):
-    usual = TransformerDriver()
-    changed = dataclasses.replace(usual, r_protection=1.05 * usual.r_protection)
-    recording = scene(driver=changed).simulate(seed=3)["loaded/0"]
-    fit = etid.identify_skin(recording, driver, throw=False)
-    assert fit.verdict in ("misfit", "inconsistent")
-
-
 def test_a_current_whose_gain_drifts_is_told(recording, driver):
     """By 1 % over the record. At 40 dB, R_p was seven standard errors off, and successful."""
     drift = 1 + 0.01 * np.arange(recording.v_out.size) / recording.v_out.size
@@ -142,27 +131,6 @@ def late_record(name: str, late: float, circuit=SKIN, seed=2, **fields) -> etid.
     return early.replace(**{name: other.samples[name]})
 
 
-@pytest.mark.slow
-def test_a_lag_of_one_record_is_taken_off():
-    """It was a misfit: v_out and the current were aligned together with v_th, never each alone."""
-    levels: dict[str, Any] = {"snr_db": 60.0, "current_snr_db": 60.0}
-    known = scene(**levels).simulate(seed=7)["calibration/0"]
-    driver = etid.identify_driver(known, order=5)
-    truths = [circuit for circuit in (SKIN, DAMP) for _ in range(2 * len(LATE))]
-    of = [
-        late_record(name, late, circuit, seed, **levels)
-        for seed, circuit in enumerate((SKIN, DAMP))
-        for name in ("current", "v_out")
-        for late in LATE
-    ]
-    fits = etid.identify_skins(of, driver)
-    assert fits.counts() == {"successful": len(of)}
-    for row, (truth, late) in enumerate(zip(truths, LATE * 4, strict=True)):
-        assert np.abs(off(fits[row], truth)).max() < WITHIN
-        if late > 1:  # the delay of a trigger decides whether one sample is more than one sample
-            assert int(fits[row].remarks) == Remark.aligned
-
-
 @pytest.mark.parametrize("name", ["current", "v_out"])
 def test_a_single_fit_takes_a_lag_off_as_a_batch_does(driver, name):
     late = late_record(name, 2.3)
@@ -186,28 +154,6 @@ def test_a_file_and_its_report_use_both_where_both_were_recorded(study, both, tm
     etid.write_report(tmp_path / "fits.h5", tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text("utf-8")
     assert "The measured current I = X / (Z_L + Z_th)" in page
-
-
-@pytest.mark.slow
-def test_draws_of_a_fit_with_both_have_its_errors_and_are_those_of_the_records_in_line(driver):
-    fit = etid.identify_skin(late_record("current", 2.3), driver)
-    draws = fit.posterior()
-    assert draws.effective > 800  # of 1000: the likelihood is normal at 60 dB
-    error = float(fit.stderr.r_p)
-    for interval in (draws.intervals()["r_p"], fit.profile("r_p").interval()):
-        # 1000 draws give an end of the interval to a tenth of a standard error.
-        expected = float(fit.circuit.r_p) + np.array([-1.96, 1.96]) * error
-        np.testing.assert_allclose(interval, expected, rtol=0, atol=0.3 * error)
-
-
-@pytest.mark.slow
-def test_another_circuit_is_seen_and_chosen(driver):
-    cole = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.9)
-    recording = scene(cole).simulate(seed=4)["loaded/0"]
-    assert etid.identify_skin(recording, driver, throw=False).verdict == "misfit"
-    fit = etid.identify_skin(recording, driver, circuit="auto")
-    assert type(fit.circuit) is etid.SkinCole
-    assert np.abs(off(fit, cole)).max() < WITHIN
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """`order="auto"`: the least order of a driver that its calibrations support."""
 
-import argparse
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +8,6 @@ import pytest
 import etid
 from benchmarks import driver_order as benchmark
 from benchmarks.ladder import CALIBRATION, rung
-from etid.commands import fit as command
 from etid.estimators.starts import source_starts
 from etid.results.driver import LARGEST, LEAST, ContinuousDriver
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
@@ -30,12 +27,6 @@ def searched(candidates):
     while (order := next_order(tried)) is not None:
         tried.append(by_order[order])
     return tried
-
-
-def test_the_search_ends_at_the_first_order_that_shows_no_pole():
-    tried = searched([candidate(LEAST, 3000.0)])
-    assert [one.order for one in tried] == [LEAST]
-    assert best(tried).order == LEAST
 
 
 def test_a_pole_that_pays_is_taken_and_one_that_does_not_is_tried_only():
@@ -118,34 +109,11 @@ def test_other_methods_say_what_to_do():
         etid.identify_driver(calibration, order="auto", method="output_error")
 
 
-def test_the_command_takes_auto_or_a_number():
-    parser = argparse.ArgumentParser(exit_on_error=False)
-    command.add_arguments(parser)
-
-    def order(text):
-        return parser.parse_args(["study.h5", "-o", "fits.h5", "--order", text]).order
-
-    assert order("auto") == "auto"
-    assert order("4") == 4
-    with pytest.raises(argparse.ArgumentError, match="--order"):
-        order("some")
-
-
 def test_spice_drivers_have_the_order_that_is_visible(reference_data):
     found = benchmark.spice_orders(reference_data(benchmark.FOLDER), ("lab_dry", "clean_dry"))
     for name, order in found.items():
         low, high = benchmark.VISIBLE[name]
         assert low <= order <= high, name
-
-
-def test_a_choice_is_right_if_its_error_is_near_the_best():
-    def found(orders, *errors):
-        of = np.broadcast_to(np.array(errors)[:, None, None], (4, 2, 3))
-        return benchmark.Found(np.broadcast_to(orders, 4), of, np.zeros((4, 2, 3)))
-
-    of = {4: found(4, 1.05), 5: found(5, 1.0), 6: found(6, 2.0)}
-    chosen = found([4, 5, 6, 6], 1.05, 1.0, 2.0, 1.4)
-    assert benchmark.right({"auto": chosen, **of}).tolist() == [True, True, False, True]
 
 
 def test_a_driver_of_two_poles_has_starts():

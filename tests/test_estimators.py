@@ -12,7 +12,7 @@ import etid
 from etid.circuits.circuit import Resistor
 from etid.estimators import registry
 from etid.estimators.estimator import AbstractEstimator, Description
-from etid.estimators.lanes import AlignedSamples, Harmonics
+from etid.estimators.lanes import AlignedSamples
 from etid.identify.options import Options
 from etid.report.methods import methods_section
 from etid.results.driver import DiscreteDriver, Driver
@@ -65,19 +65,6 @@ class Proportion(AbstractEstimator):
             text=f"The load was estimated by the proportion of both voltages, the mean {kept}.",
             errors="are one per cent",
         )
-
-
-class Given(Exception):
-    """The shapes that an estimator was given."""
-
-
-class Shapes(Proportion):
-    """What is traced for a driver on harmonics."""
-
-    lane = Harmonics
-
-    def fit_driver(self, records, r_load, order):
-        raise Given(records.shapes)
 
 
 @pytest.fixture
@@ -137,17 +124,6 @@ def test_options_are_fields_which_fits_and_their_methods_section_keep(study):
     assert "the mean taken out" in text
 
 
-def test_a_driver_on_harmonics_is_compiled_once_for_records_of_all_lengths():
-    known = (Trial("calibration/0", ResistorLoad(R_LOAD)),)
-    given = []
-    for samples in (10_000, 20_000, 34_000):
-        study = Scene((), known, samples=samples).simulate(seed=1)
-        with pytest.raises(Given) as shapes:
-            etid.identify_driver(study["calibration/0"], method=Shapes())
-        given.append(shapes.value.args[0])
-    assert given[0] == given[1] == given[2]
-
-
 def test_the_instance_of_a_name_is_the_same_method(study):
     assert Options.of(method="equation_error").estimator == etid.EquationError()
     driver = etid.identify_driver(study["calibration/0"], method=etid.EquationError(), throw=False)
@@ -158,17 +134,6 @@ def test_the_instance_of_a_name_is_the_same_method(study):
     assert fits.fit.method == str(few) == "steiglitz_mcbride(iterations=3)"
     assert int(np.max(fits.fit.steps)) < 3
     assert "by at most 3 iterations" in methods_section(StudyFits(fits, {}, {})).details
-
-
-@pytest.mark.usefixtures("_registered")
-def test_what_no_module_has_registered_is_not_described(study):
-    driver = etid.identify_driver(study["calibration/0"], method="proportion")
-    options = {"circuit": Resistor(), "method": "proportion"}
-    fits = etid.identify_skins(study.loaded, driver, **options)
-    unknown = dataclasses.replace(fits, fit=dataclasses.replace(fits.fit, method="by_hand"))
-    section = methods_section(StudyFits(unknown, {}, {}))
-    assert "The estimator 'by_hand' is not registered" in section.warning
-    assert not re.search("likelihood|output error|Steiglitz", section.details)
 
 
 @pytest.mark.parametrize(

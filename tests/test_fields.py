@@ -1,13 +1,11 @@
 """The fields of a recording are declared once: a new one is a change of one file."""
 
-import inspect
 import os
 import pathlib
 import shutil
 import subprocess
 import sys
 
-import etid
 from etid.recordings import fields
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -106,14 +104,6 @@ def test_a_new_field_passes_through_everything_from_its_declaration_alone(tmp_pa
         check=False,
     )
     assert done.returncode == 0, done.stderr
-
-
-def test_the_signature_of_a_recording_names_every_field():
-    shown = inspect.signature(etid.Recording).parameters
-    assert list(shown)[:3] == ["v_th", "v_out", "current"]
-    assert set(shown) >= {"path", *fields.DECLARED}
-    assert shown["sample_rate"].default is inspect.Parameter.empty  # it is required
-    assert shown["r_load"].default is None
 
 
 def test_type_checkers_know_the_names_of_all_fields():

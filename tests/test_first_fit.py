@@ -88,16 +88,6 @@ def test_another_dialect_is_shown_and_confirmed_by_flags(head, row, encoding, fl
         np.testing.assert_allclose(study["loaded/0"].v_out, values[:, 1], rtol=1e-12)
 
 
-def test_a_tab_is_written_on_a_command_line_as_the_error_shows_it(tmp_path, capsys):
-    file, target = tmp_path / "t.csv", tmp_path / "t.h5"
-    file.write_text("open\tout\n" + "1.5\t2.5\n" * 500, encoding="utf-8")
-    command = ["import", str(file), "-o", str(target), "--v-th", "open", "--v-out", "out",
-               "--sample-rate", "2e5", "--pulse-rate", "60", "--scale", "1"]  # fmt: skip
-    assert cli.main(command) == 1
-    flags = capsys.readouterr().err.partition("add ")[2].strip().rstrip(".")
-    assert cli.main([*command, *shlex.split(flags)]) == 0
-
-
 def test_a_calibration_is_not_split_as_the_trials_are(folder, tmp_path):
     target, table = tmp_path / "study.h5", np.genfromtxt(folder / "finger.csv", delimiter=",")[1:]
     rest, trigger = np.zeros((4000, 3)), np.arange(len(table)) < 100

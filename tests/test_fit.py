@@ -1,6 +1,5 @@
 """Intervals, correlation, table and file of one fit."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -27,15 +26,6 @@ def fit(name="successful"):
         steps=np.asarray(7),
         method="maximum_likelihood",
     )
-
-
-def batch():
-    return jax.tree.map(lambda *leaves: np.stack(leaves), fit(), fit("misfit"))
-
-
-def test_correlation_is_the_covariance_in_units_of_the_errors():
-    np.testing.assert_allclose(fit().correlation, CORRELATION, rtol=1e-12)
-    np.testing.assert_allclose(batch().correlation[1], CORRELATION, rtol=1e-12)
 
 
 @pytest.mark.parametrize("level", [0.5, 0.95, 0.99])

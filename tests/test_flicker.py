@@ -48,11 +48,6 @@ def test_the_corner_of_flicker_noise_is_found(periods, f_c):
     assert np.mean(found) == pytest.approx(f_c, rel=0.3)
 
 
-def test_a_single_period_tells_nothing():
-    v = noise(3, 1e4, 0)[:3333]
-    assert corner(v, SIGMA, RATE, 1, v.size) == 0.0
-
-
 def test_a_fit_weighs_flicker_noise():
     """Taken for white, this noise made eleven of twelve such fits a misfit."""
     study = undisturbed(0, 60.0)

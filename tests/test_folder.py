@@ -62,23 +62,11 @@ def test_the_command_replaces_no_mapping_unasked(folder, tmp_path, capsys):
     assert "left out, matches no pattern: notes.txt" in capsys.readouterr().out
 
 
-def test_a_folder_needs_labels(folder, tmp_path, capsys):
-    assert main(["import", str(folder), "-o", str(tmp_path / "study.h5")]) == 1
-    assert "Name the labels of its files, as in --labels" in capsys.readouterr().err
-
-
 def test_a_table_names_resistors_of_files_whose_names_do_not(folder):
     (folder / "calibrations.csv").write_text("file, ohm\nd1_cal_98k8.csv, 21k62\n", "utf-8")
     found, unmatched = labelled(folder, ["{subject}_{session}_{trial}.csv"])
     assert found["d1_cal_98k8.csv"]["r_load"] == 21.62e3
     assert unmatched == ["notes.txt"]
-
-
-def test_folders_in_the_folder_are_labels_too(folder):
-    (folder / "s02").mkdir()
-    (folder / "s01_d1_07.csv").rename(folder / "s02" / "d1.csv")
-    found, _ = labelled(folder, ["{subject}/{session}.csv"])
-    assert found == {"s02/d1.csv": {"subject": "s02", "session": "d1"}}
 
 
 @pytest.mark.parametrize(

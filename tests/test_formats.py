@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nptdms import ChannelObject, TdmsWriter
 
 import etid
 from etid.files import channel as channels
 from etid.files.channel import UNITS, parse_unit
 from etid.files.readers import delimited as text_rows
 from etid.recordings.recording import RecordingError
-from tests.lab_files import LINE, abf, imported, matlab, refused, rig, tdms
+from tests.lab_files import LINE, abf, imported, matlab, refused, rig, table, tdms
 
 README = pathlib.Path(__file__).parents[1] / "data_schema" / "README.md"
 RNG = np.random.default_rng(6)
@@ -52,8 +51,7 @@ def example(format):
 
 def test_the_csv_of_the_readme_is_imported_by_its_mapping(tmp_path):
     section = README.read_text("utf-8").split("### CSV\n")[1]
-    path = tmp_path / "scope.csv"
-    path.write_text(section.split("```text\n")[1].split("```")[0], encoding="utf-8")
+    path = table(tmp_path, section.split("```text\n")[1].split("```")[0])
     recordings, used = imported(path, example("CSV"))
     one = recordings["s01/dry"]
     assert (one.subject, one.condition, one.pulse_rate) == ("s01", "dry", 60.0)
@@ -124,33 +122,6 @@ def test_data_that_were_scaled_before_they_were_written_are_not_scaled_again(tmp
     np.testing.assert_allclose(imported(path, pair())[0]["loaded/0"].v_out, V_OUT / 0.0535)
 
 
-def test_a_temperature_is_no_voltage(tmp_path):
-    own = {**LINE, "NI_Scale[0]_Scale_Type": "Thermocouple"}
-    refused(rig(tmp_path, V_TH, CODES, **own), pair(), r"'rig/skin' has the scaling Thermocoup")
-
-
-def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
-    path = tmp_path / "rig.tdms"
-    with TdmsWriter(path) as writer:
-        known = {"unit_string": "V", "wf_increment": 5e-6}
-        parts = ("rig", "open"), ("rig/skin", "left"), ("rig", "skin/left")
-        writer.write_segment([ChannelObject(*part, data=V_TH, properties=known) for part in parts])
-    refused(path, pair(v_out="rig/skin/left"), "two channels have the name 'rig/skin/left'")
-
-
-def test_text_of_old_instruments_that_is_not_utf_8_is_no_obstacle(tmp_path, capfd):
-    path = rig(tmp_path, V_TH, V_OUT, comment="Gr????e")
-    path.write_bytes(path.read_bytes().replace(b"Gr????e", b"Gr\xf6\xdfenx"))
-    assert imported(path, pair())[0]["loaded/0"].sample_rate == 200e3
-    assert capfd.readouterr() == ("", "")
-
-
-def test_text_and_empty_channels_cannot_be_records(tmp_path):
-    for data, message in ((["a", "b"], "must be an array of real numbers"), ([], "is empty")):
-        values = np.array(data, "O") if data else np.zeros(0)
-        refused(rig(tmp_path, V_TH, values), pair(), rf"v_out: 'rig/skin' .*{message}")
-
-
 @pytest.mark.parametrize("cut", [1, 500, 15_900, 16_200])
 def test_a_tdms_file_that_was_cut_off_is_refused_wherever_it_was(cut, tmp_path):
     path = rig(tmp_path, V_TH, V_OUT)
@@ -199,19 +170,6 @@ def test_an_abf_file_that_was_cut_off_is_refused(tmp_path):
         refused(path, SWEEPS, "cut off|cannot be read")
 
 
-def test_an_abf_file_that_declares_more_tags_than_it_has_bytes_is_refused(tmp_path):
-    path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]))
-    content = bytearray(path.read_bytes())
-    content[48:52] = (2**30).to_bytes(4, "little")  # its list alone would take 8 GB
-    path.write_bytes(content)
-    refused(path, SWEEPS, f"declares {2**30} entries")
-
-
-def test_a_channel_in_amperes_is_no_voltage(tmp_path):
-    path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]), unit="pA")
-    refused(path, SWEEPS, r"v_th.unit: .* is in ampere \(file\)")
-
-
 # CSV
 
 
@@ -221,21 +179,13 @@ def test_a_channel_in_amperes_is_no_voltage(tmp_path):
      "open,skin\nmV,mV", '"open [mV]","skin (mV)"'],
 )  # fmt: skip
 def test_units_of_a_table_may_stand_in_its_first_or_second_line(head, tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text(f"{head}\n1,2\n3,4\n\n5,6\n", encoding="utf-8")
+    path = table(tmp_path, f"{head}\n1,2\n3,4\n\n5,6\n")
     recordings, _ = imported(path, pair("open", "skin", sample_rate=2e5))
     np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 53.5)
 
 
-def test_a_bracket_that_holds_no_unit_belongs_to_the_name(tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text("V (left),V (right)\n1,2\n3,4\n", encoding="utf-8")
-    refused(path, pair("V", "V", sample_rate=2e5), r"there is no 'V'; .* 'V \(left\)', 'V \(right")
-
-
 def test_a_table_without_names_has_numbered_columns(tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text("1,2\n3,4\n5,6\n", encoding="utf-8")
+    path = table(tmp_path, "1,2\n3,4\n5,6\n")
     refused(path, pair("1", "2", sample_rate=2e5), r"the columns 1, 2\. .* add --header-line 0")
     recordings, _ = imported(path, columns("1", "2", sample_rate=2e5, header_line=0))
     np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 0.0535)
@@ -295,13 +245,6 @@ def test_v_th_may_be_a_channel_of_another_file(tmp_path, monkeypatch):
         etid.import_file(finger, "t.h5", told)
 
 
-def test_columns_that_are_not_asked_for_may_hold_anything(tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text("note,open [V],skin [V]\nfine,1,2\n,3,4\n", encoding="utf-8")
-    recordings, _ = imported(path, pair("open", "skin", sample_rate=2e5))
-    assert recordings["loaded/0"].v_out.size == 2
-
-
 # Parts
 
 
@@ -352,13 +295,6 @@ def test_time_stamps_are_checked_in_every_part(small_parts, tmp_path):
         refused(path, said, r"time: is not uniform: sample \d+")
 
 
-def test_a_wrong_number_far_down_a_table_is_found_and_counted(small_parts, tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text("open [V],skin [V]\n" + "1,2\n" * 100 + "1,?\n", encoding="utf-8")
-    said = pair("open", "skin", sample_rate=2e5)
-    refused(path, said, r"cannot be read .*'\?'.*counted from row 92")
-
-
 # For all
 
 
@@ -381,15 +317,6 @@ def test_without_its_reader_a_file_names_what_to_install(name, package, tmp_path
 def test_a_damaged_file_is_an_error_of_that_file(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     refused(tmp_path / name, pair(), re.escape(name))
-
-
-def test_nan_samples_are_kept_for_a_verdict(tmp_path):
-    holes = np.where(np.arange(1000) == 5, np.nan, V_OUT)
-    target = tmp_path / "rig.h5"
-    etid.import_file(rig(tmp_path, V_TH, holes), target, pair())
-    with etid.read(target) as study:
-        assert np.isnan(study["loaded/0"].v_out).sum() == 1
-    assert [problem.field for problem in etid.check(target)] == ["v_out"]
 
 
 def test_units_are_those_of_the_si_and_their_names():

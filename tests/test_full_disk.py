@@ -11,11 +11,6 @@ import pytest
 import etid
 from benchmarks.specimens import study_fits
 from etid import cli
-from etid.plotting import figure_of
-from etid.plotting.style import save
-from etid.recordings.recording import RecordingError
-from etid.recordings.replacing import replace_text
-from etid.report.html import write_page
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -138,49 +133,7 @@ def test_a_run_on_a_full_disk_is_resumed(study, on_disk_of, tmp_path):
     assert not kept.exists()
 
 
-@pytest.mark.parametrize("name", ["picture.png", "picture.svg", "truth.json", "page.html"])
-def test_a_picture_and_a_text_are_written_whole_or_not_at_all(tmp_path, name):
-    target = tmp_path / name
-    target.write_bytes(b"before")
-
-    def write():
-        if name == "truth.json":
-            replace_text(target, "x" * 20_000)
-        elif name == "page.html":
-            write_page(target, "Report", "x" * 20_000, [])
-        else:
-            save(figure_of(etid.SkinRC()), target)
-
-    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, unlimited[1]))
-    try:
-        with pytest.raises(RecordingError, match=r"cannot be written .*File too large"):
-            write()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
-    assert target.read_bytes() == b"before"
-    assert list(tmp_path.iterdir()) == [target]
-    write()
-    assert target.stat().st_size > 10_000
-
-
 def test_a_device_is_not_replaced_by_a_file(capsys):
     assert cli.main(["simulate", "paper_dry", "-o", os.devnull, "--force"]) == 1
     assert "this is a device or a pipe; name a file" in capsys.readouterr().err
     assert not pathlib.Path(os.devnull).is_file()
-
-
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")
-def test_an_output_that_cannot_be_printed_is_one_line(study):
-    with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "etid", "check", study],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
-    assert done.returncode == 1
-    assert done.stderr == (
-        "etid: error: the output cannot be written ([Errno 28] No space left on device)\n"
-    )

@@ -12,7 +12,6 @@ from etid.online import projection as projection_of
 from etid.online.gain_bands import LAST_BAND, RELATIVE, WIDEST, Bands, unloaded_bands
 from etid.signals.harmonics import ALIASED
 from etid.signals.noise import RIPPLE
-from tests import kept_numbers
 
 SIZE, RATE, SIGMA = 2048, 120e3, 12.0
 DECAY = 1.0 / SIZE  # [1/sample] of the tail: a third of it is left after a period
@@ -60,18 +59,6 @@ def test_bands_follow_each_other_and_are_a_quarter_of_their_frequency(bins):
     assert 0 < width[-2] <= min(max(edges[-3] // RELATIVE, 1), WIDEST)
 
 
-def test_slopes_are_those_of_a_parabola_through_three_points():
-    x = np.array([1.0, 1.5, 2.7, 3.0, 5.0])
-    a, b, c = 0.3, -2.0, 1.7
-    y = a + b * x + c * x**2
-    near = np.stack([y[:-2], y[1:-1], y[2:]])
-    first, second = gain_bands._slopes(x)
-    np.testing.assert_allclose((first[:, 1:-1] * near).sum(0), b + 2 * c * x[1:-1], rtol=1e-12)
-    np.testing.assert_allclose((second[:, 1:-1] * near).sum(0), 2 * c, rtol=1e-12)
-    assert not first[:, [0, -1]].any()
-    assert not second[:, [0, -1]].any()
-
-
 def test_the_rate_of_a_tail_is_found_and_is_zero_where_nothing_decays():
     assert gain_bands._tail_rate(window() + 7.0) == pytest.approx(DECAY, rel=ROUNDING)
     assert gain_bands._tail_rate(-window()) == pytest.approx(DECAY, rel=ROUNDING)
@@ -108,20 +95,6 @@ def test_a_band_is_described_by_the_sums_over_its_bins():
     assert projection.floor == pytest.approx(SIZE * (RIPPLE * np.ptp(window())) ** 2, rel=0.1)
     whole = np.fft.rfft(window())[1 : bins + 1]
     np.testing.assert_allclose(of.x, whole, atol=6 * np.sqrt(variance))
-
-
-def test_edges_are_what_stands_out_of_the_noise_of_the_mean_period():
-    sigma = 25.0
-    noise = sigma * np.random.default_rng(2).standard_normal(3 * SIZE)
-    v_th = np.tile(window(), 3) + noise
-    _, projection = unloaded_bands(v_th, sigma, RATE, float(SIZE))
-    mean = v_th.reshape(3, SIZE).mean(0)
-    found = {
-        of: tuple(projection_of._partition(mean, of, projection.block)[0])
-        for of in (sigma / np.sqrt(3), sigma * np.sqrt(3))
-    }
-    assert projection.pieces == found[sigma / np.sqrt(3)]
-    assert projection.pieces != found[sigma * np.sqrt(3)]
 
 
 def test_a_bent_and_delayed_gain_departs_from_its_value_at_the_centre(exact):
@@ -163,18 +136,6 @@ def test_gain_and_noise_are_those_of_a_straight_line_in_each_band(exact):
     assert squares.sum() == pytest.approx(2 * count, rel=5 * np.sqrt(1 / count) + 0.1)
 
 
-def test_a_sample_at_the_end_of_the_range_is_clipped(exact):
-    _, projection = exact
-    low, high = window().min(), window().max()
-    for ends, clipped in (
-        ((low, np.inf), True),
-        ((-np.inf, high), True),
-        ((low - 1e-6, high + 1e-6), False),
-    ):
-        seen = projection.seen(window()[None, :], np.array(ends))
-        assert seen.clipped.tolist() == [clipped]
-
-
 def test_what_a_window_lacks_of_the_tail_is_added_to_the_gain(exact):
     """Amplitude 1 after 1 − lacking: the tail of the pulse before is smaller by this part."""
     of, projection = exact
@@ -194,6 +155,20 @@ def test_what_a_window_lacks_of_the_tail_is_added_to_the_gain(exact):
     unsure = np.asarray(of.weight) * abs(0.2 * np.asarray(found - before)) ** 2 / 2
     expected = np.asarray(of.weight) / (np.asarray(seen.variance)[:, None] + unsure)
     np.testing.assert_allclose(weight, expected, rtol=1e-6)
+
+
+def test_edges_are_what_stands_out_of_the_noise_of_the_mean_period():
+    sigma = 25.0
+    noise = sigma * np.random.default_rng(2).standard_normal(3 * SIZE)
+    v_th = np.tile(window(), 3) + noise
+    _, projection = unloaded_bands(v_th, sigma, RATE, float(SIZE))
+    mean = v_th.reshape(3, SIZE).mean(0)
+    found = {
+        of: tuple(projection_of._partition(mean, of, projection.block)[0])
+        for of in (sigma / np.sqrt(3), sigma * np.sqrt(3))
+    }
+    assert projection.pieces == found[sigma / np.sqrt(3)]
+    assert projection.pieces != found[sigma * np.sqrt(3)]
 
 
 def test_the_tail_of_a_load_has_its_own_rate_as_far_as_noise_lets_it_be_seen(exact):
@@ -233,46 +208,13 @@ def test_the_tail_of_a_load_has_its_own_rate_as_far_as_noise_lets_it_be_seen(exa
     assert of.tail_left == pytest.approx(np.exp(-1.0), rel=1e-6)
 
 
-def test_bands_and_rows_are_those_of_before():
-    """Of whole samples, and of periods that are sampled at three phases, with their aliases."""
-    rng, thirds = np.random.default_rng(5), SIZE + 1 / 3
-    t = (np.arange(9 * SIZE) % thirds) - 40
-    sharp = np.exp(-0.5 * (t / 0.9) ** 2) + 0.3 * np.exp(-DECAY * (t + 40))
-    records = {
-        "whole": (np.tile(window(), 3) + SIGMA * rng.standard_normal(3 * SIZE), SIGMA, float(SIZE)),
-        "thirds": (sharp - sharp.mean() + 1e-3 * rng.standard_normal(t.size), 1e-3, thirds),
-    }
-    numbers = {}
-    for name, (v_th, sigma, period) in records.items():
-        of, projection = unloaded_bands(v_th, sigma, RATE, period)
-        found = {
-            field: getattr(of, field) for field in ("variance_x", *DESCRIBED, "bent", "turned")
-        } | {field: getattr(of, field) for field in ("alias", "tail", "tail_left")}
-        found["x"] = np.asarray(of.x)[::50]
-        probe = np.cos(np.arange(len(projection.rows)))
-        found |= {"rows": probe @ projection.rows, "within": projection.within[::5]}
-        found |= {"shares": projection.shares()[::20], "floor": projection.floor}
-        found |= {"waveform": of.waveform()[::100]}
-        for field, value in found.items():
-            largest = np.abs(np.asarray(value)).max()
-            # The rows are in single precision.
-            numbers[f"{name}_{field}"] = kept_numbers.Number(value, 1e-6, 1e-6 * largest)
-        whole = (projection.pieces, projection.runs)
-        for field, value in zip(("pieces", "runs"), whole, strict=True):
-            numbers[f"{name}_{field}"] = kept_numbers.Number(np.array(value))
-        numbers[f"{name}_block"] = kept_numbers.Number([projection.block, projection.freedom()])
-    kept_numbers.check("gain_bands", numbers)
-
-
-def test_measured_gains_are_those_of_before(exact):
-    of, projection = exact
-    rng = np.random.default_rng(3)
-    tail = 3.0 * np.exp(-1.02 * DECAY * np.arange(SIZE))
-    v_out = np.stack([0.5 * window() - part * tail for part in (0.0, 0.2, -0.3)])
-    seen = projection.seen(v_out + 0.1 * rng.standard_normal(v_out.shape) + 0.05, UNLIMITED)
-    gain, weight = measured(of, seen, np.array([0.0, 0.4, -0.6]), np.array([0.05, 0.05, 0.0]))
-    numbers = {}
-    for name, value in (seen._asdict() | {"gain": gain, "weight": weight}).items():
-        largest = np.abs(np.asarray(value)).max()
-        numbers[name] = kept_numbers.Number(value, 1e-5, 1e-5 * largest)
-    kept_numbers.check("measured_gains", numbers)
+def test_aliases_of_periods_at_three_phases_are_those_of_a_gaussian_pulse():
+    period, width = SIZE + 1 / 3, 0.9
+    t = np.arange(9 * SIZE) % period - 40
+    of, _ = unloaded_bands(np.exp(-0.5 * (t / width) ** 2), 1e-6, RATE, period)
+    w = 2 * np.pi * np.arange(1, of.x.size + 1) / SIZE
+    x, aliased = (np.exp(-0.5 * (width * at) ** 2 - 40j * at) for at in (w, w - 2 * np.pi))
+    product, size = x.conj() * aliased, abs(x) ** 2
+    expected = np.array([product[k - 1].sum() / size[k - 1].sum() for k in bands_of(of)])
+    # A window is a third of a sample shorter than a period.
+    np.testing.assert_allclose(of.alias, expected, atol=1e-2 * abs(expected).max())

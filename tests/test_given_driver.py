@@ -1,20 +1,16 @@
 """What calibrations tell of a driver: its covariance is that of the noise, by sums written down."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
 from jax.flatten_util import ravel_pytree
 
 import etid
 from etid.estimators.estimate import DELAY_WIDTH, prior
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.signals.harmonics import spectrum
 from etid.signals.noise import noise
+from etid.signals.transfer import delayed
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
@@ -22,7 +18,6 @@ pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
 R_LOAD = 98.8e3
 KNOWN = (Trial("c", ResistorLoad(R_LOAD)),)
-STEP = 1e-5  # of a parameter, relative: differences of numbers of order 1 in double precision
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +26,7 @@ def driver():
 
 
 def information(driver):
-    """Fisher's, of Z_th and the delay, by differences, the true voltage and the noise alone."""
+    """Fisher's, of Z_th and the delay, by the true voltage and the noise alone."""
     record = Scene((), KNOWN, snr_db=None, bits=None).simulate(seed=3)["c"]
     noisy = Scene((), KNOWN).simulate(seed=3)["c"]
     rate, size = record.sample_rate, record.v_th.size
@@ -41,19 +36,14 @@ def information(driver):
     )
     sigma_th, sigma_out = (float(noise(v, np.asarray(0.0))) for v in (noisy.v_th, noisy.v_out))
     parameters, unflatten = ravel_pytree(driver.source)
-    at = np.append(np.asarray(parameters), float(driver.calibration.delay_samples[0]))
+    at = jnp.append(parameters, driver.calibration.delay_samples[0])
 
     def gain(p):
-        z = np.asarray(unflatten(jnp.asarray(p[:-1])).response(jnp.asarray(f)))
-        return R_LOAD / (R_LOAD + z) * np.exp(-2j * np.pi * f * p[-1] / rate)
+        z = unflatten(p[:-1]).response(jnp.asarray(f))
+        return delayed(R_LOAD / (R_LOAD + z), jnp.asarray(f), p[-1], jnp.asarray(rate))
 
-    slopes = []
-    for i in range(at.size):
-        step = np.zeros(at.size)
-        step[i] = STEP * max(abs(at[i]), 1.0)
-        slopes.append((gain(at + step) - gain(at - step)) / (2 * step[i]))
-    slopes = np.stack(slopes)
-    variance = (sigma_out**2 + np.abs(gain(at)) ** 2 * sigma_th**2) / size
+    slopes = np.asarray(jax.jacfwd(gain)(at)).T
+    variance = (sigma_out**2 + np.abs(np.asarray(gain(at))) ** 2 * sigma_th**2) / size
     weight = np.where(selected, 2 * np.abs(x) ** 2 / variance, 0.0)
     told = np.real((slopes * weight) @ slopes.conj().T)
     weak = jax.jacfwd(prior(driver.source, jnp.asarray(rate), jnp.asarray(R_LOAD)))(parameters)
@@ -70,48 +60,3 @@ def test_the_covariance_of_a_driver_is_the_inverse_of_its_information(driver):
     ratio = np.diagonal(driver.cov) / np.diagonal(expected)[:-1]
     assert (ratio > 0.8).all(), ratio
     assert (ratio < 1.5).all(), ratio
-
-
-@pytest.mark.slow
-def test_what_a_calibration_tells_is_one_standard_deviation_along_each_direction(driver):
-    """z is scaled by the information, so that its covariance is 1, and its mean next to 0."""
-    frequency = driver.spectra.frequency[0]
-    known = MAXIMUM_LIKELIHOOD.known(driver, frequency, False)
-    assert isinstance(known, GivenDriver)
-    of = np.linalg.eigvalsh(np.asarray(known.cov))
-    assert of.min() > 0.8, of
-    assert of.max() < 1.6, of
-    # A part of a standard deviation along the floor of the valley that one resistor leaves.
-    assert (np.abs(np.asarray(known.mean)) < 0.3).all()
-    # W is log (Z_th + R), from which Z_th comes back.
-    z = np.asarray(driver.response(frequency))
-    still = known.z_th(jnp.zeros(frequency.size, complex))
-    np.testing.assert_allclose(still, z, rtol=1e-9)
-    moved = known.z_th(jnp.full(frequency.size, 0.1 + 0.05j))
-    np.testing.assert_allclose(moved, (z + R_LOAD) * np.exp(0.1 + 0.05j) - R_LOAD, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_what_drifts_after_the_calibration_is_one_more_z_for_each_parameter(driver):
-    """∂W/∂z = σ ∂Z_th/∂p / (Z_th + R); the calibrations tell nothing about it."""
-    later, frequency = (
-        dataclasses.replace(driver, drift=jnp.asarray(0.01)),
-        driver.spectra.frequency[0],
-    )
-    before, known = (MAXIMUM_LIKELIHOOD.known(d, frequency, True) for d in (driver, later))
-    assert isinstance(before, GivenDriver)
-    assert isinstance(known, GivenDriver)
-    std, old = np.asarray(later.drift_std()), before.mean.size
-    np.testing.assert_allclose(known.mean, [*before.mean, *(0 * std)], atol=1e-9)
-    expected = scipy.linalg.block_diag(before.cov, np.eye(std.size))
-    np.testing.assert_allclose(known.cov, np.asarray(expected), atol=1e-9)
-    parameters, unflatten = ravel_pytree(later.source)
-    slope = jax.jacfwd(lambda p: unflatten(p).response(frequency))(parameters)
-    loaded = np.asarray(later.response(frequency)) + R_LOAD
-    moved = std[:, None] * np.asarray(slope).T / loaded
-    np.testing.assert_allclose(known.slope[old:], moved, atol=1e-9 * abs(moved).max())
-    np.testing.assert_allclose(known.slope[:old], before.slope, atol=1e-9)
-    assert known.gain_slopes is not None
-    assert before.gain_slopes is not None
-    assert not np.asarray(known.gain_slopes[old:]).any()
-    np.testing.assert_allclose(known.gain_slopes[:old], before.gain_slopes, atol=1e-9)

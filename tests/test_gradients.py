@@ -41,12 +41,7 @@ def test_a_resistor_follows_the_data_and_the_known_resistor_one_to_one(monkeypat
         def log_resistor(v_out, r_load):
             changed = eqx.tree_at(lambda d: d.calibration.r_load, driver, r_load)
             fit = etid.identify_samples(
-                v_th,
-                v_out,
-                changed,
-                sample_rate=40e3,
-                pulse_rate=60.0,
-                circuit=etid.Resistor(),
+                v_th, v_out, changed, sample_rate=40e3, pulse_rate=60.0, circuit=etid.Resistor()
             )
             return fit.circuit.log_values()[0]
 

@@ -1,7 +1,5 @@
 """Steiglitz-McBride on harmonics, the start of a skin: near the truth, whatever noise and delay."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,30 +50,6 @@ def test_exact_harmonics_give_the_skin_and_the_delay(name, delay):
     assert float(found) == pytest.approx(delay, abs=SUMS)
 
 
-def columns(of):
-    """Eqs. (1), (2) of the first iteration, and the column of the delay, over complex harmonics."""
-    omega = 2 * np.pi * np.asarray(of.frequency)
-    x, y, z = np.asarray(of.x), np.asarray(of.y), np.asarray(Z_TH)
-    r_s, r_p, c_p = (float(v) for v in SkinRC().values())
-    d = 1 + 1j * omega * r_p * c_p
-    n = r_s + r_p + 1j * omega * r_s * r_p * c_p
-    parts = [x - y, 1j * omega * (x - y), -1j * omega * z * y, -1j * omega * y * (n + z * d)]
-    sides = np.stack([*parts, z * y]) / np.abs(d)
-    return np.concatenate([sides.real, sides.imag], axis=1)
-
-
-def test_one_iteration_is_the_least_squares_solution_of_its_columns():
-    """Solved by a QR of tall matrices instead, at all harmonics."""
-    of = harmonics(SKINS["dry"].response(FREQUENCY), delay=0.04)
-    *sides, right = columns(of)
-    length = np.linalg.norm(sides, axis=1)
-    b0, b1, a1, delay = np.linalg.lstsq(np.transpose(sides / length[:, None]), right)[0] / length
-    skin, found = start(of, 1)
-    r_p = b0 - b1 / a1
-    np.testing.assert_allclose(skin.values(), [b1 / a1, r_p, a1 / r_p], rtol=SUMS)
-    np.testing.assert_allclose(found / RATE, delay, rtol=SUMS)
-
-
 @pytest.mark.parametrize("name", SKINS)
 def test_noise_leaves_no_bias(name):
     """Errors of 64 draws; without the compensation they are all one way, by tens of per cent."""
@@ -89,15 +63,3 @@ def test_noise_leaves_no_bias(name):
     mean, scatter = error.mean(0), error.std(0, ddof=1)
     # Of second order in the noise some is left, as of every non-linear estimate.
     assert (np.abs(mean) < 5 * scatter / np.sqrt(len(keys)) + scatter**2 + SUMS).all()
-
-
-def test_a_nan_lane_changes_no_other_lane():
-    z = SKINS["dry"].response(FREQUENCY)
-    lanes = [harmonics(z, 1e-3, 0.02, jax.random.key(i)) for i in range(4)]
-    run = jax.jit(jax.vmap(lambda s: start_of_skin(s, Z_TH, RATE, START_STEPS)))
-    clean = jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
-    broken = run(dataclasses.replace(clean, y=clean.y.at[2, 9].set(jnp.nan)))
-    others = jnp.array([0, 1, 3])
-    for a, b in zip(jax.tree.leaves(broken), jax.tree.leaves(run(clean)), strict=True):
-        assert not np.isfinite(a[2])
-        np.testing.assert_array_equal(a[others], b[others])
