@@ -46,11 +46,7 @@ def test_the_sum_over_a_shared_record_adds_what_its_loads_have_in_common():
 
 
 def test_the_covariance_with_a_shared_record_is_that_of_all_parameters_at_once():
-    """H⁻¹ Jᵀ C J H⁻¹ of three loads whose terms have unit noise each.
-
-    A part D of it is that of the unloaded record. The first two loads share one, so that their
-    terms have the covariance D₁ D₂ᵀ.
-    """
+    """H⁻¹ Jᵀ C J H⁻¹ of three loads whose terms have unit noise each."""
     draws, own, count = np.random.default_rng(1), 3, 3
     rows, total = 12, COMMON + 3 * own
     whole, parts, noise = np.zeros((count * rows, total)), [], np.zeros((count * rows, 2 * ROWS))

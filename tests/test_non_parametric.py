@@ -86,9 +86,6 @@ def test_other_pulse_rates_than_the_calibration_s_have_no_z_th(study, coarse):
         etid.identify_skin(faster, coarse, method="non_parametric")
 
 
-# --- its bias ------------------------------------------------------------------------------------
-
-
 def noisy_spectrum(count):
     """X = 3, Y = −2j."""
     one = jnp.ones(count)

@@ -84,10 +84,7 @@ def test_a_load_without_states_relaxes_too():
 
 
 def test_scores_say_how_far_a_residual_goes_along_a_change():
-    """z grows with ε, ε is found, and noise of the same power alone gives z of one.
-
-    One parameter, which the change moves by a third of it: MOVED asks for that.
-    """
+    """z grows with ε, ε is found, and noise of the same power alone gives z of one."""
     of, rng = records(), np.random.default_rng(9)
     rows = of.hold.shape[0]
     found = jax.jit(relaxed)(of, SOURCE, SKIN.impedance(), Nuisance.of(jnp.zeros(4)))

@@ -68,10 +68,7 @@ def plain(resistance):
 
 @pytest.mark.parametrize("z_load", [pytest.param(20e3, marks=pytest.mark.slow), 300e3])
 def test_a_late_calibration_is_an_excess_impedance_and_a_delay(z_load):
-    """−G sτ ((R_L − Z_L) / (Z_L + R) + 1) of V_th, a sine, all of them resistors.
-
-    The second part is a delay, which is fitted besides.
-    """
+    """−G sτ ((R_L − Z_L) / (Z_L + R) + 1) of V_th, a sine, all of them resistors."""
     r_load, r, omega = 98.8e3, 15e3, 0.2
     records = prepared(measurement(jnp.sin(omega * jnp.arange(400.0))))
     load = resistor(jnp.asarray(z_load)).rational()

@@ -98,11 +98,7 @@ def test_the_model_cell_is_what_its_maker_says(recorded):
 
 
 def test_a_recording_of_its_current_is_identified(recorded):
-    """The command passes the same filter as the current, so that it cancels out.
-
-    The noise behind this filter is not white, and etid takes the level of its fast part. Together
-    with the nominal corner this leaves a misfit, of 0.17 % of the voltage.
-    """
+    """The command passes the same filter as the current, so that it cancels out."""
     measured, steps, _ = recorded
     poles = 2 * np.pi * 2e3 * np.roots(DEN)
     t = np.arange(measured.size) / SAMPLE_RATE

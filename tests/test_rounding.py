@@ -105,11 +105,7 @@ def test_the_size_of_the_rounding_error_is_known_at_each_harmonic(samples):
 
 
 def test_neighbouring_harmonics_err_together():
-    """Slow parts of a record have few independent errors, which move many harmonics alike.
-
-    The converter has 16 random offsets, like the waveforms of `rounding_variance`: the mean squares
-    are known to a factor of 1.4.
-    """
+    """Slow parts of a record have few independent errors, which move many harmonics alike."""
     exact = study_of(bits=None, snr_db=None)["calibration/98k8"].v_out
     step = 20.0 / 2**8 / scenes.Scene().scale
     turn = np.exp(-1j * np.angle(harmonics(exact, 3, exact.size)))
