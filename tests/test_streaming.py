@@ -16,7 +16,7 @@ import pytest
 
 import etid
 from etid.identify import file as streaming
-from etid.identify.file import ResumeError, fit_file, processes
+from etid.identify.file import ResumeError, fit_file
 from etid.results.study_fits import StudyFits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -167,14 +167,6 @@ def test_kill_minus_nine_three_times(source, whole, tmp_path):
             process.send_signal(signal.SIGKILL)
         assert len(list(parts.glob("*.h5"))) >= wanted
     subprocess.run([*command, "resume"], check=True)
-    same(target, whole)
-
-
-@pytest.mark.slow
-def test_processes_give_the_same(source, whole, tmp_path):
-    target = tmp_path / "fits.h5"
-    with processes(2) as executor:
-        fit_file(source, target, method=METHOD, executor=executor)
     same(target, whole)
 
 
