@@ -19,7 +19,6 @@ from etid.online.tracker import Tracker
 from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, Sampler, SkinLoad, loading
-from tests import kept_numbers
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
@@ -595,15 +594,3 @@ def test_the_last_code_of_the_converter_is_clipped_and_the_one_before_is_not():
             verdicts = tracker.read(tracker.update(tracker.start(), pulse)).verdicts
             assert (verdicts[1] == "saturated") == clipped, (end, sample)
             assert verdicts[0] == "successful"
-
-
-def test_numbers_of_a_tracker_are_those_of_before():
-    tracker, state, clean = ten()
-    freedom = 2 * np.count_nonzero(tracker.model.bands.weight > 0) - 4
-    kept_numbers.check("tracked", kept_numbers.of_fit(tracker.read(state).fit, freedom))
-    pulse = with_noise(clean, seed=6)[8]
-    some = pulse.copy()
-    some[:4] = pulse[1:5]
-    some[7] = pulse[7] + 0.3 * abs(pulse[7]).max() * np.sin(np.arange(pulse[7].size) / 5)
-    found = tracker.read(tracker.update(state, some)).fit
-    kept_numbers.check("tracked_after_a_jump", kept_numbers.of_fit(found, freedom))

@@ -166,28 +166,6 @@ def test_tables_of_fits_are_those_of_before():
     kept_numbers.check("tables", numbers)
 
 
-def test_what_a_driver_computes_is_as_before():
-    of, f = found_driver(), jnp.array([600.0, 2e4])
-    load = DRY.response(f)
-    numbers = {
-        "order": of.order,
-        "r_known": of.r_known,
-        "late_std": of.late_std(jnp.asarray(50e3)),
-        "drift_std": of.drift_std(),
-        "later_cov": jnp.diagonal(of.later_cov()),
-        "gain": of.gain(load, f),
-        "sensitivity": of.sensitivity(load, f),
-        "log_response_stderr": of.log_response_stderr(f),
-        "response_stderr": of.response_stderr(f),
-    }
-    kept_numbers.check(
-        "driver", {name: kept_numbers.Number(value) for name, value in numbers.items()}
-    )
-    assert driver().later_cov() is driver().cov or (driver().later_cov() == driver().cov).all()
-    np.testing.assert_allclose(of.drift_std()[3], 0.02 * 1e3)  # a gain changes in proportion
-    np.testing.assert_allclose(of.drift_std()[0], 0.02)  # a logarithm by as much
-
-
 @pytest.mark.parametrize("make", [make for make, _ in SHOWN.values()], ids=SHOWN)
 def test_a_notebook_shows_the_words_of_the_terminal_as_a_table(make):
     one = make()

@@ -62,21 +62,6 @@ def test_a_recording_is_shown_whole_and_by_one_pulse(recording):
     assert "typical/dry/01" in whole.get_title(loc="left")
 
 
-def test_a_current_is_shown_below_the_voltages_over_the_same_time():
-    recording = pictures.with_current()
-    amperes = recording.samples["current"].values
-    voltage, one, current, one_current = figure_of(recording).axes
-    assert [line.get_label() for line in one.lines] == ["V_th", "V_out"]
-    assert current.get_ylabel() == one_current.get_ylabel() == "current [mA]"
-    np.testing.assert_allclose(np.asarray(current.lines[0].get_ydata()), 1e3 * amperes)
-    assert voltage.get_shared_x_axes().joined(voltage, current)
-    assert one.get_shared_x_axes().joined(one, one_current)
-    alone = recording.without_v_th().replace(current=1e-6 * amperes)  # as of a patch clamp
-    _, one, current, _ = figure_of(alone).axes
-    assert [line.get_label() for line in one.lines] == ["V_out"]
-    assert current.get_ylabel() == "current [pA]"
-
-
 def test_one_pulse_of_two_phases_is_shown_from_its_beginning():
     """Its largest step is between the phases, and twice as large as the first."""
     current = np.zeros(10_000)

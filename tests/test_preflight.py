@@ -65,11 +65,6 @@ def test_any_skin_passes(r_s, r_p, c_p, jitter, seed):
     assert preflight(one) is None
 
 
-@pytest.mark.parametrize("r", [1e3, 21.62e3, 555e3, 10e6])
-def test_any_resistor_passes(r):
-    assert preflight(simulate(ResistorLoad(r))) is None
-
-
 def test_reference_recordings_pass_but_the_clipped_ones(reference_data, tmp_path):
     folder = reference_data("spice_recordings")
     refused = {}
@@ -101,12 +96,6 @@ def test_what_is_broken_is_named(recording, which, change, name):
     assert preflight(broken) == name
 
 
-def test_numbers_whose_differences_overflow_are_not_finite(recording):
-    """And no warning is raised."""
-    huge = np.where(np.arange(LENGTH) % 2, 1e308, -1e308)
-    assert preflight(recording.replace(v_th=huge, v_out=huge)) == "nonfinite_samples"
-
-
 def test_a_single_sample_at_the_known_rail_is_saturated(recording):
     v = recording.v_out
     assert preflight(recording.replace(v_out=v, adc_range=(-200.0, v.max()))) == "saturated"
@@ -128,11 +117,6 @@ def test_the_cause_of_misaligned_records_is_named(recording, change, words):
     why = why_misaligned(Inspected(changed))
     assert re.search(words, why)
     assert explained(Inspected(changed), "misaligned").startswith(why)
-
-
-def test_swapped_records_are_misaligned(recording):
-    swapped = recording.replace(v_th=recording.v_out, v_out=recording.v_th)
-    assert preflight(swapped) == "misaligned"
 
 
 def test_the_shortest_record_is_named_before_anything_else():

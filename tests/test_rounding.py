@@ -104,25 +104,6 @@ def test_the_size_of_the_rounding_error_is_known_at_each_harmonic(samples):
     assert (ratio > 0.05).all()
 
 
-def test_neighbouring_harmonics_err_together():
-    """Slow parts of a record have few independent errors, which move many harmonics alike."""
-    exact = study_of(bits=None, snr_db=None)["calibration/98k8"].v_out
-    step = 20.0 / 2**8 / scenes.Scene().scale
-    turn = np.exp(-1j * np.angle(harmonics(exact, 3, exact.size)))
-    rng, first, sums = np.random.default_rng(5), [], []
-    for _ in range(16):
-        lifted = exact + step * rng.random()
-        coarse = np.round(lifted / step) * step
-        error = turn * harmonics(coarse - lifted, 3, exact.size)
-        known = noise.rounding_variance(coarse, step, 3, exact.size)
-        first.append(np.abs(error[0]) ** 2 / known[0])
-        # Of 25 harmonics each, of both parts, relative to the variance of independent errors.
-        together = [part[:500].reshape(-1, 25).sum(1) for part in (np.real(error), np.imag(error))]
-        sums.append(2 * np.square(together) / known[:500].reshape(-1, 25).sum(1))
-    assert np.mean(first) < 4  # it was 13
-    assert np.mean(sums, axis=0).max() < 5  # it was 22
-
-
 def test_the_bound_counts_rounding_as_what_it_is():
     """It was that of white noise of the same power, a fifth of this for R_p."""
     coarse = Scene(DRY.trials[:1], DRY.calibration, bits=8)

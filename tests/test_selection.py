@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 import etid
-from etid.circuits.elements import Ohm, PseudoCapacitance
-from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.starts import circuit_starts
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
@@ -106,33 +104,6 @@ def test_a_phase_of_a_capacitor_is_no_reason_for_a_constant_phase():
     cole = etid.SkinCole(20e3, 100e3, 30e-6, 0.995)
     assert rank(made(cole, 900.0)) == 1
     assert rank(made(dataclasses.replace(cole, alpha=jnp.asarray(0.95)), 900.0)) == 0
-
-
-class Warburg(etid.AbstractCircuit):
-    """A resistor and a diffusion, whose exponent is no parameter."""
-
-    r_s: Ohm = etid.parameter("ohm", typical=20e3)
-    q: PseudoCapacitance = etid.parameter("siemens second^alpha", typical=1e-7)
-
-    def impedance(self) -> AbstractImpedance:
-        """R_s + 1 / (Q √s)."""
-        return etid.series(etid.resistor(self.r_s), etid.constant_phase(self.q, 0.5))
-
-
-def test_an_exponent_that_is_no_parameter_is_one():
-    assert Warburg().exponents() == (0.5,)
-    assert etid.SkinRC().exponents() == ()
-    assert rank(made(Warburg(), 900.0)) == 0
-    assert not unseen(made(Warburg(), 900.0, slope=2.0)).any()
-
-
-def test_weights_are_probabilities_of_what_the_data_allow():
-    fits = {
-        0: made(etid.SkinRC(), 1000.0),
-        1: made(etid.SkinCole(), 1000.0 - np.log(TERMS)),
-        2: made(etid.Resistor(), 1020.0, "misfit"),
-    }
-    assert weights(fits) == pytest.approx({0: 0.5, 1: 0.5, 2: 0.0})
 
 
 def test_the_error_contains_the_difference_to_a_likely_circuit():

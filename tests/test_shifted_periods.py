@@ -5,8 +5,8 @@ import pytest
 
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
-from etid.recordings.causes import how_shifted, why_misaligned
-from etid.recordings.preflight import Inspected, preflight
+from etid.recordings.causes import how_shifted
+from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from tests.test_changes import falling, recorded
 from tests.test_disturbances import off
@@ -77,15 +77,6 @@ def test_an_aligned_record_is_the_undisturbed_one_after_the_period_with_the_faul
     np.testing.assert_array_equal(seen.v_out[inside], expected[inside])
 
 
-def test_faults_in_the_pulses_of_two_of_three_periods_are_refused():
-    three = rung("dry").simulate(1)[TRIAL]
-    one = faulty(three, "lost", 90)
-    assert preflight(Inspected(one)) is None
-    seen = Inspected(faulty(one, "doubled", round(PERIOD) + 90))
-    assert preflight(seen) == "misaligned"
-    assert "lost or doubled samples within pulses" in why_misaligned(seen)
-
-
 @pytest.mark.parametrize("load", LOADS)
 def test_noise_jitter_and_other_skin_do_not_shift_periods(load):
     for snr_db in (20.0, 30.0, 60.0):
@@ -96,12 +87,6 @@ def test_noise_jitter_and_other_skin_do_not_shift_periods(load):
         for fall in (0.3, 0.6):
             one = recorded(rung(load), falling(LOADS[load], name, fall))
             assert Inspected(one).shifts is None
-
-
-def test_a_pulse_that_comes_late_in_both_records_does_no_harm(records):
-    one = records["damp"]
-    both = faulty(faulty(one, "lost", 9000), "lost", 9000, "v_th")
-    assert Inspected(both).shifts is None
 
 
 @pytest.mark.parametrize("begins", [0, 200])

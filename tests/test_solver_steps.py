@@ -11,9 +11,6 @@ import pytest
 
 from etid.solvers.levenberg_marquardt import (
     LevenbergMarquardt,
-    best_start,
-    normal_equations,
-    second_order,
 )
 
 TARGET = jnp.array([5.0, -2.0])
@@ -87,27 +84,3 @@ def test_a_step_of_rounding_size_far_from_the_minimum_is_a_failure():
     converged = dataclasses.replace(NEVER, rtol=1e-6)
     near = jax.tree.map(lambda a: a + 1e-9, TARGET)
     assert after(converged, near, [near])[1][1].result == optx.RESULTS.successful
-
-
-def valley(y, args):
-    """Rosenbrock's, with a residual that is left."""
-    return jnp.stack([10 * (y[1] - y[0] ** 2), 1 - y[0], 0.1 + 0 * y[0]]), args
-
-
-def test_equations_and_curvature_are_those_written_down():
-    """r = (10 (y₁ − y₀²), 1 − y₀, 0.1): its Jacobian, and r″ = (−20 v₀², 0, 0) along v."""
-    y, v = jnp.array([0.7, 0.2]), jnp.array([0.3, -0.5])
-    r = np.array([10 * (0.2 - 0.49), 0.3, 0.1])
-    jacobian = np.array([[-14.0, 10.0], [-1.0, 0.0], [0.0, 0.0]])
-
-    def residual(y, args):
-        return valley(y, args)[0]
-
-    found = normal_equations(residual, y)
-    np.testing.assert_allclose(found.objective, r @ r / 2)
-    np.testing.assert_allclose(found.gradient, jacobian.T @ r)
-    np.testing.assert_allclose(found.matrix, jacobian.T @ jacobian)
-    bent = second_order(residual, y, v)
-    np.testing.assert_allclose(bent, jacobian.T @ [-20 * 0.09, 0.0, 0.0], rtol=1e-6)
-    starts = jnp.array([[3.0, 1.0], [0.9, 0.8], [jnp.nan, 0.0], [0.0, 0.0]])
-    np.testing.assert_array_equal(best_start(lambda y: residual(y, None), starts), starts[1])

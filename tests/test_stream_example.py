@@ -99,14 +99,6 @@ def test_a_file_is_played_to_its_end_and_logged(example, tmp_path, capsys):
         example.main(arguments)
 
 
-def test_a_long_pause_is_counted_and_not_given_pulse_by_pulse(example):
-    pulses = example.Pulses(10.0, 10, 2)
-    blocks = [(0, np.ones((2, 10))), (10**12, np.ones((2, 10)))]
-    found = [(number, np.isnan(window).all()) for number, window in pulses.cut(blocks)]
-    assert found == [(0, False), (10**11 - 1, True), (10**11, False)]
-    assert pulses.missing == 10**11 - 1
-
-
 @pytest.mark.parametrize(
     ("stored", "text"),
     [
@@ -121,22 +113,3 @@ def test_a_file_that_cannot_be_played_is_refused(example, tmp_path, stored, text
         file["other" if stored is None else "v_out"] = 0.0 if stored is None else stored
     with pytest.raises(ValueError, match=text):
         next(example.played(tmp_path / "pulses.h5", 2, 200e3, 1.0))
-
-
-def test_a_header_out_of_step_is_refused(example):
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        stream = example.received(f"127.0.0.1:{port}")
-
-        def serve():
-            line, _ = server.accept()
-            with line:
-                line.sendall(b"\xff" * 24)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        with pytest.raises(ValueError, match="-1 electrodes and -1 samples"):
-            next(stream)
-        thread.join()
-    with pytest.raises(ValueError, match="write host:port"):
-        next(example.received("localhost"))
