@@ -66,6 +66,7 @@ def test_slopes_are_those_of_a_load_with_one_more_relaxation():
         np.testing.assert_allclose(side.T, (high - low) / (2 * step), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_scores_say_how_far_a_residual_goes_along_a_change():
     """z grows with ε, ε is found, and noise of the same power alone gives z of one."""
     of, rng = records(), np.random.default_rng(9)

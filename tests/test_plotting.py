@@ -15,7 +15,7 @@ from etid.estimators.lanes import Harmonics
 from etid.plotting import figure_of
 from etid.plotting.bands import CLEAR, bands
 from etid.plotting.pulses import pulse, residual_std
-from etid.plotting.style import RED, save
+from etid.plotting.style import RED
 from etid.recordings.preflight import Inspected
 from tests import pictures
 
@@ -237,17 +237,6 @@ def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, 
     [new] = set(plt.get_fignums()) - set(before)
     assert plt.figure(new) is axes[0].figure
     plt.close(new)
-
-
-def test_equal_figures_are_equal_files(recording, tmp_path):
-    figures = [figure_of(recording) for _ in range(2)]
-    for suffix in (".png", ".svg"):
-        files = [tmp_path / f"{i}{suffix}" for i in range(2)]
-        for figure, file in zip(figures, files, strict=True):
-            save(figure, file)
-        if suffix == ".png":
-            assert files[0].read_bytes() == files[1].read_bytes()
-        assert b"<dc:date>" not in files[0].read_bytes()
 
 
 def _segments(axis):

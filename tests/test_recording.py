@@ -57,14 +57,6 @@ def test_labels_become_text_and_one_calibration_a_tuple():
     assert recording(r_load=98.8e3).is_calibration
 
 
-def test_replace_changes_what_is_named_and_keeps_the_samples():
-    one = recording(trial=1, current=np.ones(100))
-    other = one.replace(v_out=np.zeros(100), path="a/b")
-    assert other.samples["v_th"] is one.samples["v_th"]
-    assert (other.trial, other.path, other.v_out.any()) == ("1", "a/b", False)
-    assert other.current is not None
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

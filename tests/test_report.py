@@ -16,15 +16,6 @@ from etid.results.verdicts import verdict, verdicts_of
 EXCESS = 1.1  # of every identified element over the true one
 
 
-def test_table_sets_words_left_and_numbers_right():
-    table = report.Table(("name", "value", "verdict"), (("a", "1.5", "flat"), ("bc", "", "ok")))
-    assert str(table).splitlines() == [
-        "name  value  verdict",
-        "a       1.5  flat",
-        "bc           ok",
-    ]
-
-
 @pytest.mark.parametrize(
     ("rows", "groups", "message"),
     [((("1",),), (), "1 cells for 2 columns"), ((), (("x", 1),), "span 1 columns of 2")],

@@ -1,7 +1,5 @@
 """Coarse converters: their rounding error is weighed as what it is, and the fit says so."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -49,19 +47,6 @@ def test_a_fine_converter_is_not_coarse(snr_db, bits):
         assert Inspected(as_float(recording)).remarks == Remark(0)
 
 
-@pytest.mark.parametrize(("digits", "coarse"), [(3, True), (4, False)])
-def test_values_of_three_digits_are_those_of_a_coarse_converter(digits, coarse):
-    """Each value has its own step, as in a table that was printed with `%.3g`."""
-    recording = study_of(bits=None)["calibration/98k8"]
-    records = {
-        name: [float(f"{v:.{digits}g}") for v in getattr(recording, name)]
-        for name in ("v_th", "v_out")
-    }
-    seen = Inspected(recording.replace(adc_range=None, **records))
-    assert seen.remarks == (Remark.coarse_converter if coarse else Remark(0))
-    np.testing.assert_allclose(seen.step, 0.1 * coarse)  # of 63.6 V
-
-
 def test_noise_of_any_size_is_seen_through_the_steps():
     rng = np.random.default_rng(1)
     ramp, step = np.linspace(0.0, 7.0, 20_000), 1.0
@@ -102,15 +87,6 @@ def test_the_size_of_the_rounding_error_is_known_at_each_harmonic(samples):
     # One draw of an error of few independent parts, weighed as at most three times as large.
     assert (ratio < 2).all()
     assert (ratio > 0.05).all()
-
-
-def test_the_bound_counts_rounding_as_what_it_is():
-    """It was that of white noise of the same power, a fifth of this for R_p."""
-    coarse = Scene(DRY.trials[:1], DRY.calibration, bits=8)
-    fine = dataclasses.replace(coarse, bits=16)
-    r_p, white = (etid.bound(of)[DRY.trials[0].path].relative["r_p"] for of in (coarse, fine))
-    white = white * coarse.waveform().sigma / fine.waveform().sigma
-    assert 2 < r_p / white < 8
 
 
 def test_too_coarse_a_converter_says_so():

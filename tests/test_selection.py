@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 import etid
-from etid.estimators.starts import circuit_starts
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
 from etid.results.fit import CHANGES, Fit, Support
 from etid.results.verdicts import verdict
-from etid.selection.common import common, deserves
+from etid.selection.common import common
 from etid.selection.evidence import best, bic, rank, weights, with_close
 from etid.selection.search import search, usual_circuits
 from etid.selection.selection import Selection
@@ -222,12 +221,6 @@ def test_weak_evidence_of_many_recordings_decides_and_that_of_one_does_not():
     assert common([choice(strong), *[choice({0: plain})] * 3], CANDIDATES) == 0
 
 
-def test_a_recording_that_deserves_another_circuit_says_so():
-    selection = choice({0: made(etid.SkinRC(), 1100.0), 3: made(etid.SkinCole(), 1000.0)})
-    assert "supports SkinCole better: 2 log evidence +93" in deserves(selection, 0)
-    assert deserves(selection, 3) == ""
-
-
 @pytest.mark.parametrize(
     ("z", "words"),
     [
@@ -303,21 +296,6 @@ def test_the_circuit_of_a_recording_is_found(study, driver, name):
     np.testing.assert_array_equal(fit.cov, selection.fit.cov)
     error = np.asarray(fit.circuit.values()) - np.asarray(LOADS[name].values())
     assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
-
-
-def test_other_circuits_start_at_the_resistance_and_time_constant_of_the_estimate():
-    estimate = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
-    resistance, time = 33.4e3 + 186e3, 186e3 * 0.12e-9
-    assert np.exp(circuit_starts(etid.Resistor(), estimate)[-1]) == pytest.approx(
-        resistance * 100 / 120  # typical values: 100 kΩ, and 120 kΩ of SkinRC
-    )
-    r_p, c_p = np.exp(circuit_starts(etid.ParallelRC(), estimate)[-1])
-    assert (r_p, r_p * c_p) == pytest.approx((resistance * 100 / 120, time))
-    r_s, r_p, tau, alpha = np.exp(circuit_starts(etid.SkinCole(), estimate)[-1])
-    assert (r_s + r_p, tau, alpha) == pytest.approx((resistance, time, 0.8))
-    impossible = etid.SkinRC(-33.4e3, 20e3, 0.12e-9)
-    start = circuit_starts(etid.ParallelRC(), impossible)[-1]
-    np.testing.assert_array_equal(start, etid.ParallelRC().log_values())
 
 
 def test_a_spread_has_a_positive_score(study, driver):

@@ -66,17 +66,6 @@ def test_a_period_whose_pulse_has_the_fault_is_left_out(records, load, fault):
         assert f"pulse of period {period + 1}" in how_shifted(seen)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_an_aligned_record_is_the_undisturbed_one_after_the_period_with_the_fault(records, fault):
-    whole = records["damp"]
-    seen = Inspected(faulty(whole, fault, 9000))  # in the third period
-    assert seen.shifts is not None
-    np.testing.assert_array_equal(seen.v_th, whole.v_th)
-    expected = np.roll(whole.v_out, -seen.shifts.late[0])
-    inside = np.r_[1:8999, 10_001:19_998]
-    np.testing.assert_array_equal(seen.v_out[inside], expected[inside])
-
-
 @pytest.mark.parametrize("load", LOADS)
 def test_noise_jitter_and_other_skin_do_not_shift_periods(load):
     for snr_db in (20.0, 30.0, 60.0):

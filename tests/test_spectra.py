@@ -103,21 +103,6 @@ def test_numpy_and_jax_see_the_same_harmonics(periods, samples):
     assert not host[-1][(samples + 1) // (2 * periods) :].any()
 
 
-def test_the_share_of_signal_of_one_lane_does_not_depend_on_the_others():
-    generator = np.random.default_rng(5)
-    coefficients = jnp.asarray(generator.normal(size=(7, 1666)) + 1j)
-    variance = jnp.ones((7, 1666))
-    together = jax.jit(jax.vmap(signal_share))(coefficients.at[3].set(jnp.nan), variance)
-    for lane in (0, 2, 4, 6):
-        alone = signal_share(coefficients[lane], variance[lane])
-        power, noise = np.abs(coefficients[lane]) ** 2, np.ones(1666)
-        box = np.ones(25)
-        share = 1 - np.convolve(noise, box, "same") / np.convolve(power, box, "same")
-        np.testing.assert_allclose(alone, np.clip(share, 0, 1), rtol=1e-12)
-        # A batch may add the same numbers in another order.
-        np.testing.assert_allclose(together[lane], alone, rtol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("samples", "highest"),
     [
@@ -137,13 +122,6 @@ def test_harmonics_that_aliases_reach_are_left_out(samples, highest):
     assert used.max() < highest * RATE
     assert used.max() > highest * RATE - 2 * PULSE
     assert used.size == round(used.max() / PULSE)  # and none below is
-
-
-def test_real_parts_come_before_imaginary_parts():
-    values = np.array([[1 + 2j, 3 + 4j], [5 + 6j, 7 + 8j]])
-    expected = [[1, 3, 2, 4], [5, 7, 6, 8]]
-    np.testing.assert_array_equal(spectra.real_parts(values), expected)
-    np.testing.assert_array_equal(spectra.real_parts(jnp.asarray(values)), expected)
 
 
 def test_a_cubic_drift_is_not_in_the_harmonics():

@@ -92,15 +92,6 @@ def test_a_pulse_of_a_tenth_shows_what_has_changed_as_well(part):
         assert bool(differs(calibration, spectrum(later)))
 
 
-def test_hum_in_the_first_harmonics_is_no_change():
-    calibration = spectrum(study()["calibration/0"])
-    later = study(seed=1)["loaded/0"]
-    t = np.arange(later.v_th.size) / later.sample_rate
-    hum = sum(0.4 * np.sin(2 * np.pi * 60 * k * t + k) for k in (1, 2, 3, 5))
-    disturbed = later.replace(v_th=later.v_th + hum, adc_range=None)
-    assert not bool(differs(of_calibration(calibration), spectrum(disturbed)))
-
-
 @pytest.fixture(scope="module")
 def driver():
     return etid.identify_driver(study()["calibration/0"])
