@@ -140,21 +140,6 @@ def test_errors_of_calibration_widen_the_standard_errors():
         assert (np.asarray(fit.stderr.values()) < 0.03 * np.asarray(DRY.values())).all()
 
 
-def test_the_order_of_the_frequencies_does_not_matter():
-    cole = etid.SkinCole(33.4e3, 186e3, 22.3e-6, 0.9)
-    frequency, z = relative(cole, 0.02, 0)
-    mixed = np.random.default_rng(0).permutation(50)
-    fits = [
-        etid.identify_impedance(frequency[order], z[order], throw=False)
-        for order in (slice(None), mixed)
-    ]
-    assert fits[0].verdict == fits[1].verdict == "misfit"
-    np.testing.assert_allclose(*(fit.cov for fit in fits), rtol=1e-9)
-    known = fits[1].measured
-    assert known is not None
-    np.testing.assert_array_equal(known.frequency, frequency[mixed])
-
-
 def test_exact_impedances_have_no_remark():
     for circuit in (DRY, etid.Resistor()):
         fit = etid.identify_impedance(*measured(circuit, 0.0, 0), circuit=circuit)
