@@ -129,10 +129,11 @@ def test_intervals_of_joint_estimates_are_true():
                 off = [values(fit) - np.asarray(circuit.values()) for fit in fits]
                 z.append(np.stack(off) / np.stack([errors(fit) for fit in fits]))
     assert len(z) >= 2 * draws - 2
-    # 48 squares of normal errors have a mean that is known to 20 %: limits at three of these.
+    # Two fits of a draw share its driver: 24 squares have a mean that is known to 29 %, and these
+    # are three of that.
     squares = np.mean(np.square(z), axis=(0, 1))
-    assert (squares < 1.6).all(), squares
-    assert (squares > 0.4).all(), squares
+    assert (squares < 1.9).all(), squares
+    assert (squares > 0.13).all(), squares
 
 
 def test_a_current_helps_the_recordings_without_one(drawn):
