@@ -120,7 +120,7 @@ def test_an_exponent_far_above_one_is_no_circuit(alpha, expected):
     assert judged(of, etid.SkinCole(), SUCCESSFUL, "a method").verdict == expected
 
 
-@pytest.mark.parametrize("seen", itertools.product([True, False], repeat=3))
+@pytest.mark.parametrize("seen", [*itertools.product([True, False], repeat=3)])
 def test_hum_and_a_falling_or_late_resistance_are_remarks(seen):
     names = Remark.mains_hum, Remark.falls_with_current, Remark.follows_late
     expected = sum(name for name, one in zip(names, seen, strict=True) if one)
