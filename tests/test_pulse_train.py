@@ -42,12 +42,12 @@ def test_pulses_are_found_and_right_rates_pass(sample_rate, start):
             assert span * abs(train.spacing - sample_rate / PULSE) < 0.5
 
 
-@pytest.fixture(scope="module", params=[100e3, 200e3, 500e3])
+@pytest.fixture(scope="module", params=[100e3, 500e3])
 def noisy(request):
     return simulate(request.param, 6.0, snr_db=20.0)
 
 
-@pytest.mark.parametrize("periods", [1.5, 2.0, 3.0, 6.0])
+@pytest.mark.parametrize("periods", [1.5, 2.0, 6.0])
 @pytest.mark.parametrize("factor", [1 / 3, 0.5, 0.99, 1.01, 2.0, 3.0])
 def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
     """Half and double distances are no way out; from 1.5 periods on two pulses are there."""
