@@ -92,7 +92,8 @@ def test_labels_become_text_and_one_calibration_a_tuple():
 )
 def test_static_mistakes_are_named(fields, message):
     with pytest.raises(ValueError, match=message):
-        recording(**{name: value() if callable(value) else value for name, value in fields.items()})
+        given: dict[str, Any] = {n: of() if callable(of) else of for n, of in fields.items()}
+        recording(**given)
 
 
 COPIES = pytest.mark.parametrize(
