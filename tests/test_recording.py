@@ -91,9 +91,12 @@ def test_labels_become_text_and_one_calibration_a_tuple():
     ],
 )
 def test_static_mistakes_are_named(fields, message):
-    with pytest.raises(ValueError, match=message):
+    def made():
         given: dict[str, Any] = {n: of() if callable(of) else of for n, of in fields.items()}
-        recording(**given)
+        return recording(**given)
+
+    with pytest.raises(ValueError, match=message):
+        made()
 
 
 COPIES = pytest.mark.parametrize(
