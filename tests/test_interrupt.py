@@ -29,10 +29,6 @@ FIT = f"""{WAITS}
 streaming.PART, streaming._fit = 6, fit
 sys.exit(cli.main(["fit", sys.argv[1], "-o", sys.argv[2]]))
 """
-CHECK = f"""{WAITS}
-hdf5.Scan.check_samples = wait
-sys.exit(cli.main(["check", sys.argv[1]]))
-"""
 FIRST = f"""{WAITS}
 streaming.read = wait
 sys.exit(cli.main(["fit", sys.argv[1], "-o", sys.argv[2]]))
@@ -57,7 +53,7 @@ def interrupted(tmp_path_factory):
             stderr=subprocess.PIPE,
             text=True,
         )
-        for name, code in {"fit": FIT, "check": CHECK, "first": FIRST}.items()
+        for name, code in {"fit": FIT, "first": FIRST}.items()
     }
     found = {}
     for name, process in started.items():
@@ -97,8 +93,3 @@ def test_ctrl_c_before_the_first_part_says_that_nothing_was_kept(interrupted):
         f"etid: interrupted: {folder}/first.h5 was not written, and nothing was kept: run the same "
         "command again"
     ]
-
-
-def test_ctrl_c_in_another_command_says_that_nothing_was_changed(interrupted):
-    status, errors, _ = interrupted["check"]
-    assert (status, errors) == (130, ["etid: interrupted: nothing was changed"])

@@ -2,31 +2,16 @@
 
 import dataclasses
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 
 import etid
 from benchmarks.failure_axes import Cole
-from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.joint import near
-from etid.estimators.joint.fit import fit_alone
-from etid.estimators.joint.terms import Joint, Loads
-from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.starts import harmonic_starts
-from etid.estimators.unknowns import LoadUnknowns
-from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.recordings.study import Study
-from etid.results.driver import HarmonicDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
-from etid.solvers.matrices import inverse_root
 from tests import kept_numbers
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
@@ -94,96 +79,6 @@ def test_numbers_of_joint_fits_are_those_of_before(outcome):
     kept_numbers.check("joint_driver", kept_numbers.of_driver(driver))
 
 
-def test_a_load_that_is_fitted_alone_has_the_misfit_of_its_residual(study):
-    """χ² = Σ 2 |Y − G X|² / (σ_y² + |G|² σ_x²), and the prior of the delay, over what is left."""
-    calibrated = etid.identify_driver(study["calibration/0"])
-    assert isinstance(calibrated, HarmonicDriver)
-    lane = Harmonics.of(Inspected(study["odd"]))
-    of, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
-    starts = harmonic_starts(of, rate, calibrated.response(of.frequency), etid.SkinRC())
-    model = Joint(etid.SkinRC(), Calibrations.of(calibrated), False)
-    given = model.around(model.calibrations.start(), of.frequency, slopes=False)
-    own, _, chi2, rrse, hum = eqx.filter_jit(fit_alone)(model, given, of, rate, starts)
-    f, x, y, var_x, var_y, used = (np.asarray(leaf) for leaf in jax.tree.leaves(of))
-    z = np.asarray(etid.SkinRC(*np.exp(own.log_elements)).response(of.frequency))
-    z_th = np.asarray(calibrated.response(of.frequency))
-    delay = float(own.delay_samples)
-    g = z / (z + z_th) * np.exp(-2j * np.pi * f * delay / float(rate))
-    error = abs(y - g * x) ** 2 / (var_y + abs(g) ** 2 * var_x)
-    squares = 2 * error[used].sum() + (delay / DELAY_WIDTH) ** 2
-    assert float(chi2) > 1.5  # it is another circuit
-    np.testing.assert_allclose(chi2, squares / (2 * used.sum() - 4), rtol=1e-6)
-    missed = (abs(y - g * x) ** 2)[used].sum() / (abs(y) ** 2)[used].sum()
-    # RRSE is not least at the minimum: the last step, at most 0.05 standard errors, changes it.
-    np.testing.assert_allclose(rrse, np.sqrt(missed), rtol=1e-4)
-    assert not bool(hum)
-
-
-def test_gains_of_calibrations_with_the_same_unloaded_record_are_signals_of_their_own():
-    """Each signal has a real and an imaginary part: those of W first, then those of each gain."""
-    of_one, w, gains = jnp.ones(3), jnp.ones(3, complex), jnp.ones((2, 3), complex)
-    z, known = jnp.zeros(1), jnp.zeros((1, 2, 3), complex)
-    calibrated = GivenDriver(
-        frequency=of_one,
-        loaded=w,
-        w_slope=w,
-        slope=w[None],
-        resistance=jnp.array(1e4),
-        mean=z,
-        cov=z[:, None],
-        records=None,
-        gains=gains,
-        gain_slopes=known,
-    )
-    found = near._by_signals(calibrated, True)
-    parts = np.array([1, 1j])
-    expected = np.zeros((3, 2, 3), complex)  # signal, part, what it moves
-    for i in range(3):
-        expected[i, :, i] = parts
-    assert found.gain_slopes is not None
-    told = np.concatenate([found.slope[:, None], found.gain_slopes], axis=1)  # of each harmonic
-    np.testing.assert_array_equal(told, np.repeat(expected.reshape(6, 3, 1), 3, axis=2))
-    assert found.mean.shape == (6,)
-
-
-def test_the_search_at_the_knots_ends_at_the_minimum_of_all_terms(study):
-    """Of calibrations and loads; a load that takes no part stays where it starts."""
-    calibrated = etid.identify_driver(study["calibration/0"])
-    assert isinstance(calibrated, HarmonicDriver)
-    lanes = [Harmonics.of(Inspected(study[path])) for path in (*TOGETHER, "odd")]
-    own = [LoadUnknowns(jnp.log(TRUTH * (1 + 0.1 * i)), jnp.asarray(0.1 * i)) for i in range(3)]
-    loads = Loads(
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *(lane.spectrum for lane in lanes)),
-        jnp.array([lane.sample_rate for lane in lanes]),
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *own),
-        jnp.array([True, True, False]),
-        jnp.full(3, -1),
-    )
-    model = Joint(etid.SkinRC(), Calibrations.of(calibrated), False)
-    common, [owns], least = eqx.filter_jit(near.minimum)(model, [loads])
-    assert least.result == optx.RESULTS.successful
-    np.testing.assert_allclose(owns[2], own[2].vector(), rtol=1e-14)
-
-    @eqx.filter_jit
-    def terms(y):
-        common, owns = y[: -owns_of.size], y[-owns_of.size :].reshape(owns_of.shape)
-        driver = model.around(common, loads.frequency[0], slopes=False)
-        each = [model.calibrations.terms(model.calibrations.gains(common)).ravel()]
-        each.append(model.calibrations.weak(common)[0])
-        for i, own in enumerate(owns):
-            load = jax.tree.map(lambda leaf, i=i: leaf[i], loads)
-            each.append(load.behind(driver, model)(own))
-        return jnp.concatenate(each)
-
-    owns_of = owns[:2]
-    y = jnp.concatenate([common, owns_of.ravel()])
-    jacobian = jax.jacfwd(terms)(y)
-    left = terms(y) @ jacobian @ inverse_root(jacobian.T @ jacobian)
-    # Of twenty parameters together. Lines between knots are wrong by a thousandth, and the residual
-    # has a standard deviation.
-    assert float(jnp.linalg.norm(left)) < 0.1
-
-
 @pytest.mark.slow
 def test_known_elements_of_a_joint_fit_help_the_others(study, outcome):
     few = Study.from_recordings([study[path] for path in ("calibration/0", *TOGETHER)])
@@ -231,19 +126,6 @@ def test_another_skin_is_a_misfit_where_chi2_does_not_show_it():
     assert dry.counts() == {"successful": len(TRIALS)}
     # At 40 dB and more than 500 harmonics, χ² has a deviation of less than 0.05.
     np.testing.assert_allclose(dry.fit.chi2, 1.0, atol=SIGMAS * 0.05)
-
-
-@pytest.mark.slow
-def test_a_wrong_gain_is_a_misfit_where_it_moves_r_p_by_a_quarter():
-    """It was called successful. At this noise, six of eight are seen."""
-    made = simulate(Trial("odd", DRY), seed=5, snr_db=40.0)
-    odd = made["odd"]
-    wrong = odd.replace(v_out=1.01 * odd.v_out, adc_range=None)
-    others = [one for one in made.recordings() if one.path != "odd"]
-    fits = etid.identify_jointly(Study.from_recordings([*others, wrong])).fits
-    assert fits.where(path="odd").counts() == {"misfit": 1}
-    # χ² does not show it, so it weighs on the common driver: one of the others may be refused too.
-    assert fits.where(condition="dry").counts()["successful"] >= len(TRIALS) - 1
 
 
 def test_elements_are_within_their_errors_and_spread_by_their_own_part(outcome):
@@ -316,14 +198,6 @@ def test_delays_that_do_not_scatter_leave_smaller_errors_and_the_fits_say_so(out
 def test_few_points_of_the_search_evaluate_the_loads_in_full(outcome):
     """The driver's valley takes dozens of steps; none of them may need all harmonics of a load."""
     assert (np.asarray(outcome.fits.where(condition="dry").fit.steps) <= 3).all()
-
-
-def test_the_summary_tells_what_varies_from_what_is_shared(outcome):
-    row = next(r for r in outcome.fits.summary("condition") if r["condition"] == "dry")
-    for name in ("r_s", "r_p", "c_p"):
-        total = np.hypot(row[f"{name}_own"], row[f"{name}_shared"])
-        assert row[f"{name}_stderr"] == pytest.approx(total, rel=0.02)  # medians of equal trials
-        assert row[f"{name}_between"] < 3 * row[f"{name}_own"]  # the loads are all the same
 
 
 def test_a_driver_that_changed_after_its_calibration_is_no_success(study):

@@ -1,15 +1,10 @@
 """Joint fits of recordings that measured the current beside V_th."""
 
-import dataclasses
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
 from etid.recordings.remarks import Remark
-from etid.simulation.transformer import loading
 from tests.test_driver_and_current import (
     DAMP,
     LATE,
@@ -74,12 +69,20 @@ def errors(fit):
     return np.sqrt(np.diagonal(fit.cov))
 
 
+def spiked(one, size):
+    """The current with three samples that are off by so many of its heights."""
+    current = np.array(one.current)
+    current[1500:1503] += size * np.ptp(current)
+    return current
+
+
 @pytest.mark.parametrize(
     ("change", "verdict"),
     [
         (lambda one: 1.003 * one.current, "inconsistent"),
         (lambda one: 0 * one.current, "flat"),
         (lambda one: -one.current, "misaligned"),
+        (lambda one: spiked(one, 3.0), "rate_mismatch"),  # it looks like a pulse
     ],
 )
 def test_a_current_that_contradicts_the_driver_is_told(pair, joint, change, verdict):
@@ -114,85 +117,23 @@ def test_the_tolerance_of_the_known_resistor_is_what_the_current_leaves_of_it(pa
     )
 
 
-def joint_bound(of):
-    """Bound of the relative errors of all elements, (trial, element), if all records count.
-
-    X of each record and Z_th are unknown at every harmonic, as in `etid.bound`.
-    """
-    waveform = of.waveform()
-    inside = waveform.f < of.sample_rate / 2
-    f, z_th = waveform.f[inside], waveform.z_th[inside]
-    x = waveform.v_th[inside] * np.sqrt(of.samples) / waveform.sigma
-    circuits = [trial.load for trial in of.trials]
-    known = [etid.Resistor(trial.load.r) for trial in of.calibration]
-    n, e, m = len(circuits), len(SKIN.names()), len(circuits) + len(known)
-    unloaded = [0] * m if of.shared_v_th else list(range(m))
-    u = max(unloaded) + 1
-    a = np.zeros((f.size, m + u + n, n * e + m + n), complex)
-    b = np.zeros((f.size, m + u + n, u + 1), complex)
-    turn = 2j * np.pi * f * 1e-6
-    b[:, m + np.arange(u), np.arange(u)] = 1
-    for i, circuit in enumerate([*circuits, *known]):
-        z = np.asarray(circuit.response(jnp.asarray(f)))
-        g, flowing = loading(z, z_th), 1 / (z + z_th)
-        b[:, i, unloaded[i]], b[:, i, -1] = g, -g * x * flowing
-        a[:, i, n * e + i] = -turn * g * x
-        if i >= n:
-            continue
-        slope = np.asarray(
-            jax.jacfwd(lambda log, c=circuit: c.with_log_values(log).response(jnp.asarray(f)))(
-                circuit.log_values()
-            )
-        )
-        own = slice(i * e, (i + 1) * e)
-        a[:, i, own] = (x * z_th * flowing**2)[:, None] * slope
-        if of.current_snr_db is None:
-            continue
-        noise = of.current_noise(waveform.v_th / (z_of(circuit, waveform.f) + waveform.z_th))
-        weight = waveform.sigma / noise
-        row = m + u + i
-        b[:, row, unloaded[i]], b[:, row, -1] = weight * flowing, -weight * flowing**2 * x
-        a[:, row, own] = (-weight * flowing**2 * x)[:, None] * slope
-        a[:, row, n * e + m + i] = -turn * weight * flowing * x
-    used = np.abs(a).any((0, 1))
-    a = a[:, :, used]
-    q, _ = np.linalg.qr(b)
-    rest = a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)
-    flat = rest.reshape(-1, a.shape[2])
-    information = 2 * np.real(np.conj(flat.T) @ flat)
-    scale = np.sqrt(np.diagonal(information))
-    cov = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
-    return np.sqrt(np.diagonal(cov)[: n * e]).reshape(n, e)
-
-
-def z_of(circuit, f):
-    return np.asarray(circuit.response(jnp.asarray(f)))
-
-
-def test_the_bound_of_one_trial_is_that_of_etid(drawn):
-    one = dataclasses.replace(scene(), trials=scene().trials[:1])
-    np.testing.assert_allclose(joint_bound(one)[0], bound_of(one), rtol=1e-4)
-
-
-def test_joint_estimates_are_efficient_and_their_intervals_true():
+def test_intervals_of_joint_estimates_are_true():
     """Dry skin with an unloaded record for each recording, and damp skin with one for all."""
-    squares, covered, draws = [], [], 12
+    z, draws = [], 12
     for circuit, current_snr_db, shared_v_th in ((SKIN, 40.0, False), (DAMP, 30.0, True)):
         of = scene(circuit, current_snr_db=current_snr_db, shared_v_th=shared_v_th)
-        bound = joint_bound(of)
         for seed in range(draws):
             fits = etid.identify_jointly(of.simulate(seed + 2000)).fits
             assert set(fits.verdicts) <= {"successful", "inconsistent", "changed"}, seed
             if (fits.verdicts == "successful").all():
-                both = fits[0], fits[1]
-                error = np.stack([values(fit) for fit in both]) / np.asarray(circuit.values())
-                squares.append(((error - 1) / bound) ** 2)
-                covered.append(np.abs(error - 1) < 1.96 * np.stack([*map(relative, both)]))
-    assert len(squares) >= 2 * draws - 2
-    # 48 squares of normal errors have a mean that is known to 20 %, and 144 intervals, of which
-    # a third is independent, hold 95 % to 3.1 %: limits at three of these.
-    assert (np.mean(squares, axis=(0, 1)) < 1.6).all(), np.mean(squares, axis=(0, 1))
-    assert 0.86 < np.mean(covered), np.mean(covered)
+                off = [values(fit) - np.asarray(circuit.values()) for fit in fits]
+                z.append(np.stack(off) / np.stack([errors(fit) for fit in fits]))
+    assert len(z) >= 2 * draws - 2
+    # Two fits of a draw share its driver: 24 squares have a mean that is known to 29 %, and these
+    # are three of that.
+    squares = np.mean(np.square(z), axis=(0, 1))
+    assert (squares < 1.9).all(), squares
+    assert (squares > 0.13).all(), squares
 
 
 def test_a_current_helps_the_recordings_without_one(drawn):
@@ -211,17 +152,7 @@ def test_a_current_helps_the_recordings_without_one(drawn):
 
 def test_a_record_with_a_disturbed_period_leaves_its_current_out_and_says_so(pair):
     calibration, recording = pair
-    spike = np.array(recording.current)
-    spike[1500:1503] += 0.3 * np.ptp(spike)
-    fit = jointly([calibration, recording.replace(current=spike)]).fits[0]
+    fit = jointly([calibration, recording.replace(current=spiked(recording, 0.3))]).fits[0]
     assert fit.verdict == "successful"
     assert int(fit.remarks) & Remark.current_unused
     assert np.abs(off(fit)).max() < WITHIN
-
-
-def test_a_current_whose_spike_looks_like_a_pulse_is_refused(pair):
-    calibration, recording = pair
-    spike = np.array(recording.current)
-    spike[1500:1503] += 3 * np.ptp(spike)
-    found = jointly([calibration, recording.replace(current=spike)])
-    assert found.fits.verdicts.tolist() == ["rate_mismatch"]

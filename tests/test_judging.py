@@ -1,20 +1,18 @@
 """The thresholds between verdicts, on numbers of which it is clear what they are."""
 
+import itertools
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-import scipy.stats
 
 import etid
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import (
     MISFIT_CHI2,
     MISFIT_RRSE,
-    NO_CURRENT,
-    STRAINED,
     SUCCESSFUL,
     distance_to_minimum,
     judged,
@@ -91,13 +89,6 @@ def test_a_trigger_that_is_more_than_a_sample_late_or_early_is_a_misfit(delay, e
     assert name(of) == ("misfit" if expected else "successful")
 
 
-def test_a_delay_of_any_record_counts():
-    of = estimate()
-    several = jnp.array([0.1, -3.0])
-    assert bool(too_late(Estimate(**{**vars(of), "delay_samples": several})))
-    assert not bool(too_late(Estimate(**{**vars(of), "delay_samples": several[:1]})))
-
-
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -120,11 +111,6 @@ def test_every_reason_has_its_verdict(change, expected):
     assert name(estimate(**change)) == expected
 
 
-def test_limits_are_exceeded_by_chance_as_often_as_they_say():
-    assert scipy.stats.chi2.sf(STRAINED, 12) == pytest.approx(1e-4, rel=0.1)
-    assert scipy.stats.norm.sf(1 / NO_CURRENT) == pytest.approx(1 / 2000, rel=0.1)
-
-
 @pytest.mark.parametrize(("alpha", "expected"), [(1.02, "successful"), (1.1, "nonphysical")])
 def test_an_exponent_far_above_one_is_no_circuit(alpha, expected):
     """Of 1 % standard error: what a passive network cannot do is then no accident."""
@@ -134,22 +120,14 @@ def test_an_exponent_far_above_one_is_no_circuit(alpha, expected):
     assert judged(of, etid.SkinCole(), SUCCESSFUL, "a method").verdict == expected
 
 
-@pytest.mark.parametrize("hum", [True, False])
-@pytest.mark.parametrize("falls", [True, False])
-@pytest.mark.parametrize("late", [True, False])
-def test_hum_and_a_falling_or_late_resistance_are_remarks(hum, falls, late):
-    expected = (
-        Remark.mains_hum * hum + Remark.falls_with_current * falls + Remark.follows_late * late
-    )
-    assert int(remarks(*(jnp.asarray(one) for one in (hum, falls, late)))) == int(expected)
-    fit = judged(
-        estimate(hum=jnp.asarray(hum), falls=jnp.asarray(falls), late=jnp.asarray(late)),
-        etid.SkinRC(),
-        SUCCESSFUL,
-        "a method",
-    )
-    assert int(fit.remarks) == int(expected)
-    assert int(remarks(jnp.asarray(hum))) == int(Remark.mains_hum * hum)
+@pytest.mark.parametrize("seen", [*itertools.product([True, False], repeat=3)])
+def test_hum_and_a_falling_or_late_resistance_are_remarks(seen):
+    names = Remark.mains_hum, Remark.falls_with_current, Remark.follows_late
+    expected = sum(name for name, one in zip(names, seen, strict=True) if one)
+    hum, falls, late = map(jnp.asarray, seen)
+    assert int(remarks(hum, falls, late)) == expected
+    fit = judged(estimate(hum=hum, falls=falls, late=late), etid.SkinRC(), SUCCESSFUL, "a method")
+    assert int(fit.remarks) == expected
 
 
 def test_the_distance_to_the_minimum_is_in_standard_errors():
@@ -174,14 +152,15 @@ def test_logarithms_become_elements_and_their_errors():
     np.testing.assert_allclose(fit.shared_cov, 0.25 * fit.cov, rtol=1e-12)
 
 
-@pytest.mark.parametrize("before", ["successful", "misfit"])
-@pytest.mark.parametrize("bad", [True, False])
-def test_a_later_test_overrules_success_only(before, bad):
-    fit = judged(
-        estimate(chi2=1.0 if before == "successful" else 9.0, rrse=0.1),
-        etid.SkinRC(),
-        SUCCESSFUL,
-        "a method",
-    )
-    after = unless(fit, jnp.asarray(bad), RESULTS.biased).verdict
-    assert after == ("biased" if bad and before == "successful" else before)
+@pytest.mark.parametrize(
+    ("chi2", "bad", "verdict"),
+    [
+        (1.0, True, "biased"),
+        (1.0, False, "successful"),
+        (9.0, True, "misfit"),
+        (9.0, False, "misfit"),
+    ],
+)
+def test_a_later_test_overrules_success_only(chi2, bad, verdict):
+    fit = judged(estimate(chi2=chi2, rrse=0.1), etid.SkinRC(), SUCCESSFUL, "a method")
+    assert unless(fit, jnp.asarray(bad), RESULTS.biased).verdict == verdict

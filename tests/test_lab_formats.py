@@ -66,12 +66,6 @@ def test_a_labview_file_says_how_it_is_written(separator, decimal, columns, tmp_
     assert str(used.signals["v_out"]) == "'skin' in mV (file)"
 
 
-def test_a_file_that_is_not_of_labview_is_refused(tmp_path):
-    (tmp_path / "a.lvm").write_text("time,a,b\n0,1,2\n")
-    with pytest.raises(RecordingError, match="is not a LabVIEW measurement file"):
-        imported(tmp_path / "a.lvm", v_th="a", v_out="b")
-
-
 def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
     openpyxl = pytest.importorskip("openpyxl")
     th, out = pulses(2)

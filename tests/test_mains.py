@@ -105,20 +105,6 @@ def test_a_record_that_is_not_finite_has_no_hum(value):
     assert mains.separated(v, 0.01, 200e3, 3, 10_000) is None
 
 
-def test_between_the_harmonics_of_10_hz_is_no_hum():
-    """50 and 60 Hz and their multiples are harmonics: no bin between them is left to look at."""
-    v = np.random.default_rng(0).standard_normal((1, 60_000))
-    assert not quick_looks.humming(v, np.array([1.0]), 200e3, 10.0, 3, 60_000).any()
-
-
-def test_a_drift_is_no_hum(records):
-    of = records[1]
-    time = np.arange(of.v_th.size) / of.sample_rate
-    fields = {"sample_rate": of.sample_rate, "pulse_rate": of.pulse_rate}
-    drifting = etid.Recording(of.v_th + 5 * np.sin(6 * time), of.v_out * (1 + time), **fields)
-    assert Inspected(drifting).remarks == Remark(0)
-
-
 @pytest.mark.parametrize("frequency", [50.0, 60.0, 59.97])
 def test_elements_are_those_without_hum(records, quiet, frequency):
     calibration, skin = (hummed(one, frequency, 0.1, seed) for seed, one in enumerate(records))
@@ -140,14 +126,6 @@ def test_hum_in_a_batch_costs_the_other_recordings_nothing(records, quiet):
     assert set(fits.verdicts) == {"successful"}
     assert (np.asarray(fits.circuit.r_p)[[0, 2]] == np.asarray(alone.circuit.r_p)).all()
     np.testing.assert_allclose(np.asarray(fits.circuit.r_p)[1], fit.circuit.r_p, rtol=2e-3)
-
-
-@pytest.mark.slow
-def test_hum_does_not_excuse_a_wrong_circuit(records, quiet):
-    loud = hummed(records[1], 60.0, 0.02)
-    fit = etid.identify_skin(loud, quiet[0], circuit=etid.Resistor(), throw=False)
-    assert fit.verdict == "misfit"
-    assert int(fit.remarks) == 0
 
 
 def louder(recording, factor):
@@ -173,15 +151,6 @@ def test_a_wrong_gain_is_a_misfit_where_chi2_does_not_show_it():
     kept_numbers.check("wrong_gain_noisy", kept_numbers.of_fit(fit))
     assert fit.verdict == "misfit"
     assert fit.chi2 < MISFIT_CHI2
-
-
-@pytest.mark.slow
-def test_the_non_parametric_method_leaves_hum_out(records, quiet):
-    driver, _ = quiet
-    clean = etid.identify_skin(records[1], driver, method="non_parametric")
-    fit = etid.identify_skin(hummed(records[1], 60.0, 0.02), driver, method="non_parametric")
-    assert int(fit.remarks) == Remark.mains_hum
-    assert in_errors(fit, clean).max() < 1
 
 
 @pytest.mark.slow

@@ -10,17 +10,13 @@ from etid.plotting import style
 from etid.plotting.layout import FINGERTIP, Layout, read_layout
 from etid.plotting.maps import draw_map
 from etid.recordings.errors import RecordingError
+from tests import pictures
 
 
 @pytest.fixture(scope="module")
 def display():
-    """Fits of three trials, each at two electrodes; the last is no success."""
-    study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
-    driver = etid.identify_driver(study["calibration/98k8"], order=5)
-    records = [study[path] for path in list(study.loaded)[:3]]
-    hummed = records[2].v_out + 20 * np.sin(np.arange(records[2].v_out.size) / 7)
-    records[2] = records[2].replace(v_out=hummed)
-    fits = etid.identify_skins(records * 2, driver)
+    """Three fits of each of two days at the same electrodes; the last of each is no success."""
+    fits = pictures.fits().take(np.array([0, 2, 1] * 2))
     names = np.array(["E1", "E8", "E98", "E1", "E9", "E98"], object)
     days = np.array(["d1"] * 3 + ["d2"] * 3, object)
     return dataclasses.replace(fits, labels={**fits.labels, "electrode": names, "session": days})

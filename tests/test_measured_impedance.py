@@ -20,18 +20,6 @@ def test_a_table_of_impedances_is_read_and_fitted(tmp_path):
         etid.read_impedance(tmp_path / "z.csv", "gamry")
 
 
-def test_a_file_of_zplot_is_read(tmp_path):
-    pytest.importorskip("impedance")
-    rows = "\n".join(
-        f"{f:.6e}, 0, 0, 0, {np.real(z):.6e}, {np.imag(z):.6e}" for f, z in zip(F, Z, strict=True)
-    )
-    head = "\"ZPLOT2 ASCII\"\nFreq(Hz)\tAmpl\tBias\tTime(Sec)\tZ'(a)\tZ''(b)\nEnd Comments\n"
-    (tmp_path / "z.z").write_text(head + rows.replace(", ", "\t") + "\n")
-    frequency, impedance = etid.read_impedance(tmp_path / "z.z", "zplot")
-    np.testing.assert_allclose(frequency, F, rtol=1e-5)
-    np.testing.assert_allclose(impedance, Z, rtol=1e-5)
-
-
 def test_what_is_missing_is_named(tmp_path):
     with pytest.raises(RecordingError, match="Use one of gamry"):
         etid.read_impedance(tmp_path / "z.csv", "gamri")

@@ -55,8 +55,7 @@ def test_a_driver_of_too_low_an_order_says_so(identified):
 
 
 def test_an_order_that_is_high_enough_shows_noise_only(identified):
-    """Squares of two degrees of freedom: mean 2. Neighbouring sections are alike: of 108 some ten
-    tell something of their own, so that the mean over eight draws is known to 0.22."""
+    """Squares of two degrees of freedom."""
 
     @jax.jit
     def squares_of(calibrations):

@@ -86,12 +86,6 @@ def test_an_element_is_thirty_lines():
     assert len(inspect.getsource(DavidsonCole).splitlines()) <= 30
 
 
-def test_its_impedance_is_its_formula():
-    s = 2j * np.pi * FREQUENCY
-    expected = 33.4e3 + 186e3 / (1 + s * 40e-6) ** 0.7
-    np.testing.assert_allclose(TRUTH.response(jnp.asarray(FREQUENCY)), expected, rtol=1e-12)
-
-
 def test_it_is_fitted():
     is_found(fitted()[2])
 
@@ -113,13 +107,6 @@ def test_its_netlist_is_a_ladder():
     expected = np.asarray(TRUTH.response(jnp.asarray(FREQUENCY)))
     found = impedance_of(etid.netlist(TRUTH), FREQUENCY)
     np.testing.assert_allclose(found, expected, rtol=LADDER)
-
-
-def test_a_picture_has_its_parameters():
-    recording, driver, fit = fitted()
-    title = etid.plot(fit, recording, driver)[0].get_title(loc="left")
-    assert f"beta {float(fit.circuit.values()[3]):.2f}" in title
-    assert "tau " in title
 
 
 def test_a_record_for_which_no_default_is_left_says_what_to_do():

@@ -10,14 +10,10 @@ import pytest
 import etid
 from benchmarks.coverage import scene
 from benchmarks.ladder import LOADS
-from etid.estimators.lanes import Harmonics
 from etid.estimators.non_parametric import fit as non_parametric
-from etid.estimators.unknowns import LoadUnknowns
-from etid.recordings.preflight import Inspected
 from etid.results.driver import HarmonicDriver
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import Spectrum
-from etid.signals.transfer import as_complex
 from tests import kept_numbers
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
@@ -86,9 +82,6 @@ def test_other_pulse_rates_than_the_calibration_s_have_no_z_th(study, coarse):
         etid.identify_skin(faster, coarse, method="non_parametric")
 
 
-# --- its bias ------------------------------------------------------------------------------------
-
-
 def noisy_spectrum(count):
     """X = 3, Y = −2j."""
     one = jnp.ones(count)
@@ -113,45 +106,3 @@ def test_bias_is_what_noise_adds_on_average():
     np.testing.assert_allclose(of_x, 0.01 * count, rtol=scatter)
     np.testing.assert_allclose(of_y, 0.04 * count, rtol=scatter)
     np.testing.assert_allclose(linear, 3 * count - 2 * count, rtol=1e-12)
-
-
-def test_one_unloaded_record_has_one_noise():
-    """x − x′ of two recordings with the same unloaded record is without any."""
-    one = noisy_spectrum(50)
-    other = dataclasses.replace(one, x=one.x + as_complex(jnp.ones(50)))
-
-    def apart(records):
-        return jnp.sum(jnp.abs(records[0].x - records[1].x) ** 2)[None]
-
-    assert float(non_parametric._bias(apart, [one, one])[0]) == 0.0
-    assert float(non_parametric._bias(apart, [other, one])[0]) > 50 + 0.005 * 50
-
-
-def test_bias_is_taken_off_the_estimate(study, coarse, monkeypatch):
-    """In the place of a bias the change that a larger Y makes; R alone keeps it cheap."""
-    lane = Harmonics.of(Inspected(study["dry"]))
-    rate = jnp.asarray(lane.sample_rate)
-    start = LoadUnknowns(jnp.array([[np.log(150e3)]]), jnp.zeros(1))
-
-    @jax.jit
-    def fit(spectrum, larger):
-        def bias(change, records):
-            more = dataclasses.replace(records[-1], y=records[-1].y * larger)
-            return change([*records[:-1], more])
-
-        with monkeypatch.context() as patched:
-            patched.setattr(non_parametric, "_bias", bias)
-            estimate, off, _ = non_parametric.fit_circuit(
-                etid.Resistor(), coarse, spectrum, rate, start
-            )
-        return estimate.parameters, off
-
-    spectrum = lane.spectrum
-    one = jnp.asarray(1.0 + 0j)
-    plain, nothing = fit(spectrum, one)
-    moved, _ = fit(dataclasses.replace(spectrum, y=spectrum.y * 1.001), one)
-    corrected, off = fit(spectrum, one * 1.001)
-    assert float(abs(nothing[0])) < 1e-6  # a minimum is refound to a thousandth of its error
-    assert float(off[0]) > 1e-3  # more voltage, more resistance
-    np.testing.assert_allclose(off, moved - plain, rtol=1e-2)
-    np.testing.assert_allclose(corrected - plain, -off, rtol=1e-2)

@@ -64,10 +64,6 @@ def running_kernel(tmp_path, monkeypatch):
     return "running"
 
 
-def test_there_is_a_notebook():
-    assert NOTEBOOKS
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_opens_in_jupyter_as_it_is(path):
     """Its file for Jupyter has the cells of the script, without outputs: `jupytext --sync`."""

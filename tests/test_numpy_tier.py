@@ -2,7 +2,6 @@
 
 import functools
 import itertools
-import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,6 @@ from jax import lax
 
 from etid.numpy_tier import UntranslatableError, translated
 from etid.numpy_tier.primitives import RULES
-from etid.numpy_tier.translator import written
 
 EPSILON = {"f": 8, "c": 16}  # roundings of both results; complex products add two of them
 REAL = (np.float64, np.float32)
@@ -109,36 +107,50 @@ def test_a_function_of_two_numbers(function, dtype):
     check(function, a, b, rounding=100 if function in APPROXIMATE else 4)
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (2, 3), (1, 3)])
-def test_numbers_in_arrays_of_any_shape(shape):
-    x = np.full(shape, 0.5)
-    check(lax.sin, x)
-    check(lax.add, x, -x)
-    check(lambda x: lax.convert_element_type(x, np.int32), x)
+X = np.random.default_rng(0).normal(size=(3, 4, 5))
+KEYS = (*(X[:2] * 2).round(), X[2])
+OTHER = {  # functions, and their operands
+    "of no number": (lambda x: lax.sin(x) + x, np.zeros((2, 0))),
+    "of one number": (lambda x: lax.convert_element_type(lax.sin(x), np.int32), np.array(0.5)),
+    "clamped": (lax.clamp, *(np.roll(pairs(np.float64)[0], n) for n in (40, 0, 90))),
+    "rounded": (lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), every(np.float64)),
+    "chosen": (lax.select, X > 0, X, X[::-1]),
+    "chosen at once": (lax.select, np.bool_(True), X, X[::-1]),
+    "one of three": (lax.select_n, (abs(X) % 3).astype(np.int32), X, -X, X[::-1]),
+    "slope of what is made complex": (
+        lambda x: jax.linear_transpose(lambda y: y.astype(complex), x.real)(x)[0],
+        X + 1j * X[::-1],
+    ),
+    "gaps": (lambda x: jnp.sum(x, axis=0), np.where(X > 1, np.nan, X)),
+    "sum of nothing": (lambda x: (x.sum(1), x.sum(0), jnp.cumsum(x, 1)), np.zeros((2, 0))),
+    "least of nothing": (
+        lambda x: lax.reduce_min_p.bind(x, axes=(1,), out_sharding=None),
+        np.zeros((2, 0)),
+    ),
+    "sorted by one": (lambda *of: lax.sort(of, dimension=1, num_keys=1), *KEYS),
+    "sorted by two": (lambda *of: lax.sort(of, dimension=0, num_keys=2), *KEYS),
+    "nothing is looked up": (lambda x, at: (x[at], x.at[at].set(1.0)), X, np.zeros((0, 2), int)),
+    "no step": (lambda x: lax.fori_loop(3, 3, lambda i, y: y + i, x), X),
+    "algebra of nothing": (
+        lambda a: (jnp.linalg.cholesky(a), lax.linalg.triangular_solve(a, a, lower=True)),
+        np.zeros((0, 0)),
+    ),
+}
 
 
-@pytest.mark.parametrize("dtype", REAL)
-def test_a_power_of_another_type(dtype):
-    x, y = every(dtype), np.array([-3, -1, 0, 1, 2, 7], np.int32)
-    check(lax.pow, np.repeat(x, y.size), np.tile(y, x.size), rounding=100)
+@pytest.mark.parametrize("name", OTHER)
+def test_another_function(name):
+    function, *operands = OTHER[name]
+    check(function, *operands, rounding=8)
 
 
-@pytest.mark.parametrize("power", [-3, -1, 0, 1, 2, 3, 7])
+@pytest.mark.parametrize("power", [-3, 0, 1, 2, 7])
 @pytest.mark.parametrize("dtype", [*REAL, np.complex128])
 def test_a_whole_power(power, dtype):
     x = every(dtype)
     check(lambda x: lax.integer_pow(x, power), x if dtype in REAL else x + (x == 0), rounding=8)
-
-
-@pytest.mark.parametrize("dtype", REAL)
-def test_clamped_selected_and_rounded_numbers(dtype):
-    x, low = pairs(dtype)
-    high, which = low[::-1].copy(), np.arange(x.size) % 3
-    check(lax.clamp, low, x, high)
-    check(lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), x)
-    check(lax.select, which == 1, x, high)
-    check(lax.select, np.bool_(True), x, high)
-    check(lambda which, *of: lax.select_n(which, *of), which.astype(np.int32), low, x, high)
+    if dtype in REAL:
+        check(lax.pow, x, np.full(x.size, power, np.int32), rounding=100)
 
 
 @pytest.mark.parametrize(
@@ -151,13 +163,6 @@ def test_clamped_selected_and_rounded_numbers(dtype):
 )
 def test_numbers_of_another_type(old, new):
     check(lambda x: lax.convert_element_type(x, new), every(old))
-
-
-def test_the_slope_by_a_number_that_is_made_complex_is_real():
-    def slope(towards):
-        return jax.linear_transpose(lambda x: x.astype(complex), towards.real)(towards)[0]
-
-    check(slope, every(np.complex128))
 
 
 @pytest.mark.parametrize(
@@ -182,28 +187,8 @@ def test_a_function_along_an_axis(function, dtypes):
     for dtype, axis in itertools.product(dtypes, range(3)):
         drawn = rng.choice(every(dtype, finite=True), (4, 3, 5))  # with equal ones among them
         check(functools.partial(function, axis=axis), drawn, rounding=8)
-    gaps = np.where(rng.random((4, 3, 5)) < 0.3, np.nan, 1.0).astype(dtypes[0])
-    check(functools.partial(function, axis=0), gaps)
 
 
-def test_reductions_of_nothing():
-    empty = np.zeros((2, 0))
-    for function in (jnp.sum, jnp.prod, jnp.cumsum, jnp.sort):
-        check(lambda x, of=function: of(x, axis=1), empty)
-        check(lambda x, of=function: of(x, axis=0), empty)
-    check(lambda x: lax.reduce_max_p.bind(x, axes=(1,), out_sharding=None), empty)
-    check(lambda x: lax.reduce_min_p.bind(x, axes=(1,), out_sharding=None), empty)
-
-
-def test_several_arrays_sorted_by_the_first_ones():
-    rng = np.random.default_rng(1)
-    keys = rng.integers(0, 3, (2, 20)), rng.integers(0, 3, (2, 20)), rng.normal(size=(2, 20))
-    for count in (1, 2, 3):
-        check(lambda *of, n=count: lax.sort(of, dimension=1, num_keys=n), *keys)
-        check(lambda *of, n=count: lax.sort(of, dimension=0, num_keys=n), *keys)
-
-
-X = np.random.default_rng(0).normal(size=(3, 4, 5))
 SHAPED = {
     "broadcast": lambda x: jnp.broadcast_to(x[:, None, :, :1], (3, 2, 4, 5)) + 1.0,
     "broadcast scalar": lambda x: jnp.full((2, 3), x[0, 0, 0]).reshape(3, 2).T @ jnp.ones((3, 4)),
@@ -229,7 +214,6 @@ SHAPED = {
 
 @pytest.mark.parametrize("name", SHAPED)
 def test_an_array_of_another_shape(name):
-    check(SHAPED[name], X)
     check(SHAPED[name], np.where(X > 1, np.nan, X))
 
 
@@ -263,11 +247,6 @@ def test_elements_are_looked_up(name):
     check(LOOKED_UP[name], X, AT)
     check(lambda x: LOOKED_UP[name](x, AT), X)  # at places that are known
     check(lambda at: LOOKED_UP[name](jnp.asarray(X), at), AT)
-
-
-def test_nothing_is_looked_up():
-    check(lambda x, at: x[at], X, AT[:0])
-    check(lambda x, at: x.at[at].set(1.0), X, AT[:0])
 
 
 EINSUMS = (
@@ -327,12 +306,6 @@ def test_linear_algebra(name, batch):
     check(ALGEBRA[name], root @ root.swapaxes(-1, -2) + 2 * np.eye(4), rounding=1e4)
 
 
-def test_factors_of_an_empty_matrix_are_found_without_a_word(capfd):
-    for shape in ((0, 0), (2, 0, 0)):
-        check(ALGEBRA["lu"], np.zeros(shape))
-    assert capfd.readouterr() == ("", "")
-
-
 @pytest.mark.parametrize(
     "name", ["cholesky", "inverse", "lower", "eigenvalues", "roots", "singular values"]
 )
@@ -347,15 +320,9 @@ def test_matrices_without_a_result(name):
 def test_a_matrix_without_a_result_leaves_the_others_alone(name):
     good = np.diag([1.0, 2.0, 3.0, 4.0]) + 0.1
     both = np.stack([np.full((4, 4), np.nan), good])
-    program = translated(jax.make_jaxpr(ALGEBRA[name])(both))
-    alone = translated(jax.make_jaxpr(ALGEBRA[name])(good[None]))
+    program, alone = (translated(jax.make_jaxpr(ALGEBRA[name])(of)) for of in (both, good[None]))
     for one, other in zip(program([both]), alone([good[None]]), strict=True):
         np.testing.assert_array_equal(one[1], other[0])
-
-
-def test_algebra_of_nothing():
-    check(jnp.linalg.cholesky, np.zeros((0, 0)))
-    check(ALGEBRA["lower"], np.zeros((0, 0)))
 
 
 @pytest.mark.parametrize("size", [8, 9, 5])
@@ -364,9 +331,6 @@ def test_a_fourier_transform(size):
         check(lambda x, of=function: of(x, n=size), X, rounding=20)
     check(lambda x: jnp.fft.irfft(x, n=size), X + 1j * X[::-1], rounding=20)
     check(lambda x: jnp.fft.rfft2(x, s=(size, 4)), X, rounding=20)
-
-
-# --- Programs -------------------------------------------------------------------------------------
 
 
 def root(x):
@@ -433,28 +397,11 @@ PROGRAMS = {
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_program(name, seed):
-    check(PROGRAMS[name], np.random.default_rng(seed).normal(size=(3, 4)), rounding=400)
-
-
-def test_nan_and_infinities_go_the_same_way():
-    x = np.array([[np.nan, 1.0], [np.inf, -np.inf]])
-    for name in ("while", "scan", "cond", "own derivative", "map"):
-        check(PROGRAMS[name], x, rounding=40)
-
-
-def test_a_loop_without_steps_leaves_what_it_began_with():
-    check(lambda x: backwards(x[:0]), X)
-    check(lambda x: lax.fori_loop(3, 3, lambda i, y: y + i, x), X)
-
-
-def test_what_does_not_change_is_computed_before_the_loop():
-    text, _ = written(jax.make_jaxpr(recursion)(X[0]))
-    inside = [line for line in text.splitlines() if line.startswith("  ")]  # of the step
-    assert "=exp" in text
-    assert inside
-    assert not any("=exp" in line for line in inside)
+def test_a_program(name):
+    x = np.random.default_rng(1).normal(size=(3, 4))
+    check(PROGRAMS[name], x, rounding=400)
+    if name in ("while", "scan", "cond", "own derivative", "map"):
+        check(PROGRAMS[name], np.array([[np.nan, 1.0], [np.inf, -np.inf]]), rounding=40)
 
 
 @pytest.mark.parametrize(
@@ -479,21 +426,6 @@ def test_a_parameter_that_nobody_here_knows_is_refused():
     assert callable(RULES["rev"]({"dimensions": (0,)}, [], []))
     with pytest.raises(UntranslatableError):
         RULES["rev"]({"dimensions": (0,), "of_a_later_version": 1}, [], [])
-
-
-def test_memory_does_not_grow_with_the_length_of_a_program():
-    def chain(x):
-        for _ in range(30):
-            x = jnp.sin(x)
-        return x
-
-    x = np.ones(100_000)
-    run = translated(jax.make_jaxpr(chain)(x))
-    tracemalloc.start()
-    run([x])
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 4 * x.nbytes
 
 
 def test_a_program_does_not_change_its_operands():

@@ -11,25 +11,14 @@ import pytest
 import scipy.stats
 
 import etid
-from etid.estimators.joint.fit import fit_alone
-from etid.estimators.joint.terms import Joint
-from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import given_driver
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.estimators.starts import harmonic_starts
 from etid.identify.fitting import known_at
-from etid.online import alarms, gain_bands, tick
+from etid.online import alarms
 from etid.online.tracker import Tracker
-from etid.recordings.preflight import Inspected
-from etid.report.methods import methods_section
-from etid.report.study import summary
 from etid.results.driver import ContinuousDriver
-from etid.results.study_fits import StudyFits
-from etid.signals.harmonics import ALIASED
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, Sampler, SkinLoad, loading
-from tests import kept_numbers
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
@@ -73,6 +62,19 @@ def loaded(study):
     return np.stack([study[name].v_out for name in LOADS])
 
 
+def tiled(of):
+    """What is of dry and damp skin in turn, for ten electrodes."""
+    return np.tile(of, (TEN // 2, *[1] * (np.ndim(of) - 1)))
+
+
+@functools.cache
+def ten():
+    """Ten electrodes, dry and damp in turn, after eight pulses; and their pulses."""
+    tracker = tracker_of(TEN)
+    clean = np.tile(tracker.pulses(loaded(quiet())), (1, TEN // 2, 1))
+    return tracker, followed(tracker, with_noise(clean[:8], seed=1)), clean
+
+
 def with_noise(pulses, seed):
     return pulses + NOISE * np.random.default_rng(seed).standard_normal(pulses.shape)
 
@@ -99,33 +101,10 @@ def own_stderr(fits):
     return np.sqrt(own) / np.asarray(fits.circuit.values())
 
 
-@pytest.mark.slow
-def test_constant_skin_is_found_within_its_standard_errors_from_the_second_tenth_of_a_second_on():
-    study = scene(40, trigger_jitter_rms=500e-9).simulate(seed=5)
-    tracker = tracker_of(2)
-    pulses = tracker.pulses(loaded(study))
-    state = tracker.start()
-    fits, widths = tracker.read(state), []
-    assert set(fits.verdicts) == {"too_short"}
-    for number, v_out in enumerate(pulses):
-        state = tracker.update(state, v_out)
-        fits = tracker.read(state)
-        if number >= 9:
-            assert set(fits.verdicts) == {"successful"}
-            z = (np.asarray(fits.circuit.values()) - TRUTH) / np.asarray(fits.stderr.values())
-            assert (np.abs(z) < 4).all()  # of 186 dependent ones, seeded
-            widths.append(own_stderr(fits))
-    assert (fits.fit.steps >= len(pulses) - 5).all()
-    # The noise of the pulses averages out; the error of the driver does not.
-    gain = np.sqrt((fits.fit.steps - 30) / fits.fit.steps)
-    np.testing.assert_allclose(widths[-1], widths[-31] * gain[:, None], rtol=0.1)
-    assert (np.diagonal(fits.fit.shared_cov, axis1=1, axis2=2) > 0).all()
-
-
 def test_the_second_pulse_compiles_nothing():
-    tracker = tracker_of(2)
+    tracker, _, clean = ten()
     first = tracker.start(), tracker.start(at_rest=True)
-    after = tracker.update(first[0], tracker.pulses(loaded(quiet()))[0])
+    after = tracker.update(first[0], clean[0])
     for state in first:
         for one, other in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
             assert one.aval == other.aval  # shape, type, and whether the type is weak
@@ -133,23 +112,13 @@ def test_the_second_pulse_compiles_nothing():
 
 
 def test_a_tracker_and_its_state_are_printed_without_arrays():
-    tracker = tracker_of(2)
+    tracker = tracker_of(TEN)
     shown = " ".join(repr(tracker).split())
-    assert "Tracker of SkinRC, driver successful electrodes 2 period" in shown
+    assert "Tracker of SkinRC, driver successful electrodes 10 period" in shown
     assert "f64[" not in shown
-    assert "State of 2 electrodes after 0 pulses, last pulse: 2 too_short" in repr(tracker.start())
-
-
-def test_the_tracker_describes_itself_in_a_report():
-    """And not as the default of other identifications, which it is not."""
-    tracker = tracker_of(2)
-    fits = tracker.read(followed(tracker, tracker.pulses(loaded(scene(4).simulate(seed=5)))))
-    told = StudyFits(fits, {}, {})
-    methods = methods_section(told).details
-    assert "by on-line tracking" in summary(told)
-    assert "iterated at each pulse (Bell and Cathey, 1993)" in methods
-    for wrong in ("aximum likelihood", "utput error", "Both occurred", "Levenberg"):
-        assert wrong not in methods + summary(told)
+    assert "State of 10 electrodes after 0 pulses, last pulse: 10 too_short" in repr(
+        tracker.start()
+    )
 
 
 FACTOR = 3.0  # of every element from the values where the tracker starts
@@ -187,14 +156,14 @@ def explained():
     driver, _ = calibrated()
     assert isinstance(driver, ContinuousDriver)
     source = driver.source
-    tracker = Tracker.of(driver, quiet()["cal/0"], electrodes=2)
+    tracker = Tracker.of(driver, quiet()["cal/0"], electrodes=TEN)
     model = tracker.model
     model = dataclasses.replace(model, source=source.response(model.bands.frequency))
     tracker = dataclasses.replace(tracker, model=model)
     sampler, v_th, *_ = scene(1)._exact()
     z_th = np.asarray(source.response(jnp.asarray(sampler.f)))
     v_out = [v_th * loading(load(sampler.f), z_th) for load in LOADS.values()]
-    return tracker, np.stack([sampler.sample(v, 33_340, 0.3e-6) for v in v_out])
+    return tracker, tiled(np.stack([sampler.sample(v, 33_340, 0.3e-6) for v in v_out]))
 
 
 def anew(state):
@@ -222,14 +191,14 @@ def test_without_noise_its_bias_is_about_a_tenth_of_the_noise_of_100_pulses_at_6
         state = tracker.update(state, v_out)
     found = np.asarray(tracker.read(state).circuit.values())
     # 0.10 of it for R_p of dry skin; the standard error of one pulse scatters by 2 %.
-    assert (np.abs(found / TRUTH - 1) < 0.11 * hundred).all(), (found / TRUTH - 1) / hundred
+    off = found / tiled(TRUTH) - 1
+    assert (np.abs(off) < 0.11 * hundred).all(), off / hundred
 
 
 def test_what_is_known_of_skin_fades_as_a_random_walk_says():
     """(Λ⁻¹ + q² 1)⁻¹ after a pulse that tells nothing; without a walk not a bit of it."""
-    still = tracker_of(2)
-    state = followed(still, with_noise(still.pulses(loaded(quiet()))[:8], seed=4))
-    nothing = np.full((2, 3333), np.nan)
+    still, state, _ = ten()
+    nothing = np.full((TEN, 3333), np.nan)
     known = np.asarray(state.electrodes.information)
     np.testing.assert_array_equal(still.update(state, nothing).electrodes.information, known)
     walking = dataclasses.replace(still, change=jnp.asarray(0.03))
@@ -242,10 +211,10 @@ def test_what_is_known_of_skin_fades_as_a_random_walk_says():
 
 
 def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
-    tracker = tracker_of(2)
+    tracker, _, clean = ten()
     driver, _ = calibrated()
     known = known_at(tracker.model.bands.frequency, driver, False, MAXIMUM_LIKELIHOOD)
-    pulses = tracker.pulses(loaded(quiet()))[:6]
+    pulses = clean[:6]
     state = followed(tracker, with_noise(pulses, seed=4))
     step = 1e-3  # of a standard deviation of Z_th
 
@@ -281,62 +250,20 @@ def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
     assert (np.diagonal(of_x, axis1=1, axis2=2) > 0).all()  # of X
 
 
-# Standard errors. Both weigh the noise of V_th, but not in the same way, and neighbouring bands
-# share noise of the blocks. Over six seeds the estimates differ by 0.22, 0.27 and 0.13 (standard
-# deviation of R_s, R_p, C_p), with means below 0.12: one leaves out some 6 % of the information
-# about R_p. The seed is fixed; 1.5 of these deviations.
-SAME = 0.4
-
-
-@pytest.mark.slow
-def test_after_some_pulses_it_is_what_a_batch_fit_of_these_periods_is():
-    """With the same Z_th, and the harmonics of the same band."""
-    tracker, v_out = explained()
-    driver, _ = calibrated()
-    v_out = with_noise(v_out, seed=6)
-    pulses = tracker.pulses(v_out)
-    state = followed(tracker, pulses)
-    fits = tracker.read(functools.reduce(tracker.update, pulses, anew(state)))
-    assert list(fits.verdicts) == ["successful"] * 2
-    assert (fits.fit.steps == len(pulses) + 1).all()
-    unloaded = quiet()["cal/0"].v_th
-    for number, one in enumerate(v_out):
-        size = one.size
-        record = etid.Recording(unloaded[:size], one, sample_rate=RATE, pulse_rate=PULSES)
-        apart = np.asarray(fits.circuit.values())[number] / batch(driver, record) - 1
-        assert (np.abs(apart) < SAME * own_stderr(fits)[number]).all(), (
-            apart / own_stderr(fits)[number]
-        )
-
-
-def batch(driver, recording):
-    """Elements by maximum likelihood from the harmonics of a whole record, with the same Z_th."""
-    lane = Harmonics.of(Inspected(recording))
-    spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
-    model = Joint(etid.SkinRC(), Calibrations.of(driver), False)
-    selected = spectrum.selected & (spectrum.frequency < ALIASED * RATE)
-    spectrum = dataclasses.replace(spectrum, selected=selected)
-    z_th = driver.response(spectrum.frequency)
-    starts = harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
-    given = model.around(model.calibrations.start(), spectrum.frequency, slopes=False)
-    own, *_ = fit_alone(model, given, spectrum, rate, starts)
-    return np.exp(np.asarray(own.log_elements))
-
-
-def test_a_lane_without_numbers_changes_no_bit_of_the_other_and_nor_does_their_order():
-    tracker = tracker_of(2)
-    pulses = with_noise(tracker.pulses(loaded(quiet()))[:8], seed=1)
+def test_a_lane_without_numbers_changes_no_bit_of_the_others_nor_does_their_order():
+    tracker, _, clean = ten()
+    pulses = with_noise(clean[:8], seed=1)
     ill = pulses.copy()
     ill[:4, 1] = np.nan
     ill[4:, 1, 100] = np.inf
-    good, bad = followed(tracker, pulses), followed(tracker, ill)
-    assert list(tracker.read(bad).verdicts) == ["successful", "nonfinite_samples"]
-    good, bad = jax.tree.leaves(good.electrodes), jax.tree.leaves(bad.electrodes)
-    for one, other in zip(good, bad, strict=True):
-        np.testing.assert_array_equal(one[0], other[0])
-    turned = jax.tree.leaves(followed(tracker, pulses[:, ::-1]).electrodes)
-    for one, other in zip(good, turned, strict=True):
-        np.testing.assert_array_equal(one, other[::-1])
+    good, bad = followed(tracker, pulses).electrodes, followed(tracker, ill)
+    assert tracker.read(bad).verdicts[1] == "nonfinite_samples"
+    both = zip(jax.tree.leaves(good), jax.tree.leaves(bad.electrodes), strict=True)
+    for one, other in both:
+        np.testing.assert_array_equal(np.delete(one, 1, 0), np.delete(other, 1, 0))
+    turned = followed(tracker, pulses[:, ::-1]).electrodes
+    # Samples are summed in single precision, in an order that depends on the place of a lane.
+    np.testing.assert_allclose(turned.own[::-1], good.own, rtol=1e-5)
 
 
 HIGHEST = 100.0  # [V] at which the converter of these pulses ends
@@ -384,28 +311,6 @@ def test_electrodes_in_trouble_say_so_at_once_and_recover():
     assert (fits.fit.steps[len(TROUBLES) :] >= len(pulses) - 6).all()
 
 
-def test_skin_that_jumps_is_found_with_the_first_pulse_after_it():
-    tracker = tracker_of(2)
-    pulses = with_noise(np.tile(tracker.pulses(loaded(quiet())), (3, 1, 1)), seed=2)
-    pulses[15:] = pulses[15:, ::-1].copy()
-    state = followed(tracker, pulses[:15])
-    assert tracker.changes(state) == []
-    for v_out in pulses[15:]:
-        state = tracker.update(state, v_out)
-        if int(state.number) == 16:
-            found = tracker.changes(state)
-            assert [(one.electrode, one.kind, one.pulse) for one in found] == [
-                (0, "jump", 16),
-                (1, "jump", 16),
-            ]
-        else:
-            assert tracker.changes(state) == []
-        fits = tracker.read(state)
-        assert set(fits.verdicts) == {"successful"}
-        z = (np.asarray(fits.circuit.values()) - TRUTH[::-1]) / np.asarray(fits.stderr.values())
-        assert (np.abs(z) < 4).all()
-
-
 def drifting(tracker, truth, seed):
     """Pulses of elements (pulse, electrode, element), each as if they did not change during it."""
     whole = scene(3)
@@ -421,48 +326,15 @@ def drifting(tracker, truth, seed):
         yield np.stack(v_out) + NOISE * rng.standard_normal((len(electrodes), 3333))
 
 
-def walk(change, pulses, electrodes, seed):
-    steps = change * np.random.default_rng(seed).standard_normal((pulses, electrodes, 3))
-    return TRUTH[0] * np.exp(np.cumsum(steps, axis=0))
-
-
-CHANGE = 2e-3  # [1/√pulse], about what one pulse tells at 60 dB
-
-
-def z_of_walk(electrodes, pulses, seed):
-    """Errors of tracked logarithms in standard errors of the noise, without those of the driver."""
-    driver, _ = calibrated(seed % 3)
-    tracker = Tracker.of(driver, quiet()["cal/0"], electrodes=electrodes, change=CHANGE)
-    truth = walk(CHANGE, pulses, electrodes, seed)
-    state, z = tracker.start(), []
-    still = np.log(batch(driver, quiet()["dry"]) / TRUTH[0])  # what the driver's error makes of it
-    for number, v_out in enumerate(drifting(tracker, truth, seed)):
-        state = tracker.update(state, v_out)
-        if number >= 15 and number % 5 == 0:
-            fits = tracker.read(state)
-            good = fits.verdicts == "successful"
-            error = np.log(np.asarray(fits.circuit.values()) / truth[number]) - still
-            z.append((error / own_stderr(fits))[good])
-    return np.concatenate(z)
-
-
 def held(z):
     return (np.abs(z) < NORMAL_95).mean(axis=0)
 
 
-@pytest.mark.slow
-def test_drifting_skin_is_followed_and_its_intervals_hold_it():
-    z = z_of_walk(electrodes=16, pulses=41, seed=0)
-    assert len(z) >= 90  # of 96
-    # Five pulses apart the errors are nearly independent: three deviations of 96 draws.
-    assert (np.abs(held(z) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / len(z))).all(), held(z)
-    assert (z.std(axis=0) > 0.75).all(), z.std(axis=0)
-
-
 def test_skin_that_drifts_though_it_should_not_is_said_to_drift_and_found_again():
-    """A tenth of a standard error of one pulse of R_p per pulse."""
-    tracker = tracker_of(2)
-    truth = TRUTH * np.exp(3e-5 * np.arange(60))[:, None, None]
+    """A tenth of a standard error of one pulse of R_p per pulse, at two electrodes."""
+    tracker = tracker_of(TEN)
+    truth = np.repeat(tiled(TRUTH)[None], 60, axis=0)
+    truth[:, :2] *= np.exp(3e-5 * np.arange(60))[:, None, None]
     state, kinds, reasons = tracker.start(), set(), set()
     for number, v_out in enumerate(drifting(tracker, truth, seed=1)):
         state = tracker.update(state, v_out)
@@ -504,7 +376,7 @@ def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent():
 
 def test_weights_are_those_of_the_noise_in_the_bands():
     """And slopes that are alike in neighbouring bands have the stated information."""
-    tracker = tracker_of(2)
+    tracker = tracker_of(TEN)
     noise = NOISE * np.random.default_rng(9).standard_normal((4000, 3333))
     seen = tracker.projection.seen(noise, np.array([-np.inf, np.inf]))
     bands = tracker.model.bands
@@ -522,13 +394,6 @@ def test_weights_are_those_of_the_noise_in_the_bands():
         assert abs(told - 1) < 0.08, (first, told)  # five standard errors of 8000 draws
 
 
-def test_windows_are_those_next_to_each_period():
-    v = np.arange(40.0)
-    np.testing.assert_array_equal(gain_bands.cut(v, 10.0)[:, 0], [0, 10, 20, 30])
-    np.testing.assert_array_equal(gain_bands.cut(v, 10.4)[:, 0], [0, 10, 21])
-    assert gain_bands.cut(v[None, :9], 10.0).shape == (0, 1, 10)
-
-
 @pytest.mark.slow
 def test_a_circuit_of_ones_own_is_tracked():
     driver, study = calibrated()
@@ -542,44 +407,9 @@ def test_a_circuit_of_ones_own_is_tracked():
 @pytest.mark.parametrize("kind", [np.int16, bool, complex])
 def test_codes_of_a_converter_are_not_taken_for_volts(kind, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # a user has no type checker
-    tracker = tracker_of(2)
+    tracker = tracker_of(TEN)
     with pytest.raises(etid.RecordingError, match=r"v_out: has dtype .*by volts per code"):
-        tracker.update(tracker.start(), np.zeros((2, 3333), kind))
-
-
-# --- changes --------------------------------------------------------------------------------------
-
-
-def test_innovations_of_constant_and_wandering_skin_have_the_distribution_of_the_tests():
-    """The Kalman filter of a linear scene: T and Q exceed the 1 % point of chi-squared in 1 %."""
-    lanes, pulses, elements, walked = 512, 60, 3, 0.3
-    rng = np.random.default_rng(4)
-    root = rng.standard_normal((elements, elements))
-    told = root @ root.T + np.eye(elements)
-    spread = np.linalg.inv(told)
-    noise = rng.standard_normal((pulses, lanes, elements)) @ np.linalg.cholesky(spread).T
-    truth = np.cumsum(walked * rng.standard_normal((pulses, lanes, elements)), axis=0)
-    seen = truth + noise
-
-    @jax.vmap
-    def step(carry, d):
-        estimate, information, mean, cov = carry
-        before = tick.predicted(information, jnp.asarray(walked))
-        new = alarms.Innovation.of(d - estimate, jnp.asarray(spread), before)
-        moving = alarms.averaged(mean, cov, new)
-        after = before + told
-        estimate = estimate + jnp.linalg.solve(after, jnp.asarray(told) @ new.d)
-        carry = estimate, after, moving.d, moving.cov
-        return carry, jnp.stack([new.statistic(), moving.statistic()])
-
-    cov = jnp.zeros((lanes, elements, elements))
-    first = jnp.asarray(seen[0]), jnp.broadcast_to(told, cov.shape), jnp.zeros((lanes, 3)), cov
-    _, tests = jax.lax.scan(step, first, jnp.asarray(seen[1:]))
-    limit = scipy.stats.chi2.isf(0.01, elements)
-    share = (np.asarray(tests) > limit).mean(axis=(0, 1))
-    # T is independent from pulse to pulse; Q of about 20 pulses counts as one.
-    number = np.array([1.0, 1 / 20]) * lanes * (pulses - 1)
-    assert (np.abs(share - 0.01) < 4 * np.sqrt(0.01 / number)).all(), share
+        tracker.update(tracker.start(), np.zeros((TEN, 3333), kind))
 
 
 def test_the_limit_of_the_tests_is_that_of_the_stated_rate_of_false_alarms():
@@ -588,53 +418,36 @@ def test_the_limit_of_the_tests_is_that_of_the_stated_rate_of_false_alarms():
     np.testing.assert_allclose(hourly, alarms.FALSE_ALARMS, rtol=1e-6)
 
 
-@functools.cache
-def ten():
-    """Ten electrodes, dry and damp in turn, after eight pulses; and their pulses."""
-    tracker = tracker_of(TEN)
-    clean = np.tile(tracker.pulses(loaded(quiet())), (1, TEN // 2, 1))
-    return tracker, followed(tracker, with_noise(clean[:8], seed=1)), clean
-
-
 def test_a_change_of_a_few_electrodes_is_theirs_and_one_of_all_the_driver_s():
     tracker, state, clean = ten()
     pulse = with_noise(clean, seed=2)[8]
     some = pulse.copy()
     some[:4] = pulse[1:5]  # dry and damp change places
     found = tracker.update(state, some)
-    assert [(one.electrode, one.kind) for one in tracker.changes(found)] == [
-        (0, "jump"),
-        (1, "jump"),
-        (2, "jump"),
-        (3, "jump"),
-    ]
     assert not bool(found.driver_changed)
+    jumps = [(one.electrode, one.kind, one.pulse) for one in tracker.changes(found)]
+    assert jumps == [(electrode, "jump", 9) for electrode in range(4)]
+    other = with_noise(clean, seed=3)[8]
+    other[:4] = other[1:5]
+    again = tracker.update(found, other)
+    assert tracker.changes(again) == []
+    truth = tiled(TRUTH)
+    truth[:4] = truth[1:5]
+    for after in (found, again):
+        fits = tracker.read(after)
+        assert set(fits.verdicts) == {"successful"}
+        z = (np.asarray(fits.circuit.values()) - truth) / np.asarray(fits.stderr.values())
+        assert (np.abs(z) < 4).all()
     found = tracker.update(state, 1.005 * pulse)
     assert [(one.electrode, one.kind) for one in tracker.changes(found)] == [(None, "driver")]
     assert set(tracker.read(tracker.update(found, pulse)).verdicts) == {"inconsistent"}
-
-
-def test_an_electrode_whose_search_diverged_is_identified_by_the_next_pulse():
-    """e^800 is no number: behind a short circuit a search goes there."""
-    tracker, _, clean = ten()
-    start = tracker.start()
-    far = np.array(start.electrodes.own)
-    far[:3, :3], far[3, :3] = 800.0, np.nan
-    own = jax.device_put(jnp.asarray(far), start.electrodes.own.sharding)
-    start = dataclasses.replace(start, electrodes=dataclasses.replace(start.electrodes, own=own))
-    found = tracker.read(tracker.update(start, with_noise(clean[8], seed=2)))
-    assert set(found.verdicts) == {"successful"}
 
 
 REPEATED = 8  # times ten electrodes
 
 
 def test_weak_pulses_do_not_add_up_to_a_wrong_answer():
-    """A fifteenth of the amplitude at 40 dB: one pulse knows R_s of damp skin to 40 %.
-
-    Information about logarithms that was added up as it came gave 65 of 240 electrodes more than
-    four standard errors off; what is known of R_s in ohm gives 10.
-    """
+    """A fifteenth of the amplitude at 40 dB."""
     amplitude, settled, off = 0.067, 0, []
     tracker, *_ = ten()
     pulses = amplitude * tracker.pulses(loaded(quiet()))[:, 1:]
@@ -667,8 +480,8 @@ def test_an_amplitude_that_is_told_is_no_change():
 
 
 def test_a_display_at_rest_is_identified_from_the_second_pulse_on():
-    tracker = tracker_of(2)
-    pulses = with_noise(tracker.pulses(loaded(quiet()))[:2], seed=1)
+    tracker, _, clean = ten()
+    pulses = with_noise(clean[:2], seed=1)
     state = tracker.update(tracker.start(at_rest=True), pulses[0])
     assert set(tracker.read(state).verdicts) == {"too_short"}
     assert set(tracker.read(tracker.update(state, pulses[1])).verdicts) == {"successful"}
@@ -677,7 +490,7 @@ def test_a_display_at_rest_is_identified_from_the_second_pulse_on():
 @pytest.mark.parametrize(("before", "now"), [(1.0, 0.2), (0.3, 1.0), (0.0, 1.0)])
 def test_the_first_pulse_of_another_amplitude_lacks_a_tail_which_is_no_misfit(before, now):
     """A pulse alone: one in two periods, so that the second of them is what it leaves behind."""
-    tracker = tracker_of(2)
+    tracker, _, clean = ten()
     whole = scene(1)
     driver, corner = whole.driver, whole.antialias * RATE
     sampler = Sampler(RATE, PULSES / 2, corner)
@@ -685,33 +498,20 @@ def test_the_first_pulse_of_another_amplitude_lacks_a_tail_which_is_no_misfit(be
     z_th = driver.z_th(sampler.f)
     alone = [v_th * loading(load(sampler.f), z_th) for load in LOADS.values()]
     first, second = (
-        np.stack([sampler.sample(v, 3333, start) for v in alone]) for start in (0.0, 1 / PULSES)
+        tiled(np.stack([sampler.sample(v, 3333, start) for v in alone]))
+        for start in (0.0, 1 / PULSES)
     )
-    state = followed(tracker, with_noise(tracker.pulses(loaded(quiet()))[:6], seed=1))
+    state = followed(tracker, with_noise(clean[:6], seed=1))
     known = after_amplitude(state, before)
     v_out = with_noise(now * first + before * second, seed=3)
     state = tracker.update(known, v_out, now)
     fits = tracker.read(state)
-    assert list(fits.verdicts) == ["successful"] * 2
+    assert set(fits.verdicts) == {"successful"}
     assert tracker.changes(state) == []
     assert (fits.fit.steps == 7).all()
     blind = dataclasses.replace(state, electrodes=known.electrodes)
     blind = after_amplitude(blind, now)
     assert set(tracker.read(tracker.update(blind, v_out, now)).verdicts) == {"misfit"}
-
-
-def test_a_residual_that_noise_makes_once_in_a_thousand_pulses_is_no_misfit():
-    """A pulse has 74 degrees of freedom: its χ² exceeds 1.5 in one of three hundred."""
-    tracker, state, clean = ten()
-    noise = 10 * (with_noise(clean[8], seed=5) - clean[8])  # 40 dB
-    verdicts = {}
-    for factor in (1.2, 2.5):
-        of_pulse = np.where(np.arange(3333) < 400, factor, 1.0)
-        found = tracker.update(state, clean[8] + of_pulse * noise)
-        verdicts[factor] = list(tracker.read(found).verdicts)
-        assert (found.electrodes.chi2 > 1.5).any()
-    assert verdicts[1.2] == ["successful"] * TEN
-    assert verdicts[2.5] == ["misfit"] * TEN
 
 
 def test_bad_electrodes_are_listed_with_the_reason():
@@ -728,70 +528,15 @@ def test_bad_electrodes_are_listed_with_the_reason():
 
 def test_the_last_code_of_the_converter_is_clipped_and_the_one_before_is_not():
     """The range in the record is the truth: samples at its ends may have been any voltage."""
-    tracker, study = tracker_of(2), calibrated()[1]
+    (tracker, _, clean), study = ten(), calibrated()[1]
     limits = study["cal/0"].adc_range
     assert limits is not None
     low, high = limits
     step = 2 * high / 2**16
-    pulse = with_noise(tracker.pulses(loaded(quiet()))[3], seed=1)
+    pulse = with_noise(clean[3], seed=1)
     for end, inner in ((low, step), (high, -step)):
         for sample, clipped in ((end, True), (end + inner, False)):
             pulse[1, 200] = sample
             verdicts = tracker.read(tracker.update(tracker.start(), pulse)).verdicts
             assert (verdicts[1] == "saturated") == clipped, (end, sample)
             assert verdicts[0] == "successful"
-
-
-def numbers_of(tracker, state):
-    """What a state says, and what it holds.
-
-    Samples are summed in single precision, in an order that depends on the processor. Its error is
-    a hundredth of what noise makes of a gain. Standard errors are those of the state, which holds
-    them also for an electrode whose last pulse has no samples.
-    """
-    Number, shift = kept_numbers.Number, kept_numbers.SHIFT
-    fits, held = tracker.read(state), state.electrodes
-    freedom = 2 * np.count_nonzero(tracker.model.bands.weight > 0) - held.own.shape[-1]
-    squares = kept_numbers.of_spread(tracker.model.noise_freedom)
-    own = np.sqrt(np.diagonal(np.linalg.inv(held.information), axis1=1, axis2=2))  # of logarithms
-    of_gain = np.asarray(held.rrse) / np.sqrt(freedom)  # of one pulse, relative
-    of_mean = np.sqrt(np.diagonal(held.mean_cov, axis1=1, axis2=2))
-    elements, delay = np.asarray(fits.circuit.values()), np.asarray(held.own)[:, -1]
-
-    def matrix(values):
-        scale = np.sqrt(np.diagonal(values, axis1=1, axis2=2))
-        return Number(values, absolute=squares * scale[:, :, None] * scale[:, None, :])
-
-    numbers = kept_numbers.of_fit(fits.fit, freedom) | {
-        "elements": Number(elements, absolute=shift * own * elements),
-        "level": Number(held.level, shift * of_gain),
-        "variance": Number(held.variance, squares),
-        "offset": Number(held.offset, absolute=shift * NOISE / np.sqrt(PERIOD)),
-        "amplitude": Number(held.amplitude),  # given
-        "mean_cov": matrix(held.mean_cov),
-        "information": matrix(held.information),
-        "delay": Number(delay, absolute=shift * np.std(delay)),  # the same for all electrodes
-        "mean": Number(held.mean, absolute=shift * of_mean),
-        "factor": Number(held.factor, absolute=shift * own),
-    }
-    for name in ("pulses", "missed", "event", "element", "drifted"):
-        numbers[name] = Number(getattr(held, name))
-    return numbers
-
-
-def test_numbers_of_a_tracker_are_those_of_before():
-    """Followed, in another amplitude, and after a jump of some and a misfit of one."""
-    tracker, state, clean = ten()
-    kept_numbers.check("tracked", numbers_of(tracker, state))
-    pulse = with_noise(clean, seed=6)[8]
-    some = pulse.copy()
-    some[:4] = pulse[1:5]
-    some[7] = pulse[7] + 0.3 * abs(pulse[7]).max() * np.sin(np.arange(pulse[7].size) / 5)
-    some[8] = np.nan
-    found = tracker.update(state, some)
-    kept_numbers.check("tracked_after_a_jump", numbers_of(tracker, found))
-    amplitude = np.linspace(0.5, 2.0, TEN)
-    # The windows are those of a steady state, so that the pulse before had the same amplitude.
-    state = after_amplitude(state, amplitude)
-    found = tracker.update(state, pulse * amplitude[:, None], amplitude)
-    kept_numbers.check("tracked_amplitudes", numbers_of(tracker, found))

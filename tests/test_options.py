@@ -10,8 +10,6 @@ import pytest
 
 import etid
 from etid import cli
-from etid.identify import file as files
-from etid.identify.options import Options
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -71,15 +69,12 @@ def test_all_functions_of_skin_take_the_same_options(study):
     fit = etid.identify_skin(recording, driver, circuit=STRING, **options)
     many = etid.identify_skins([recording], driver, circuit=STRING, **options)[0]
     chosen = etid.select_circuit(recording, driver, candidates=[STRING], **options).fit
-    several = etid.identify_amplitudes([recording], driver, circuit=STRING, **KNOWN)
-    for one in (fit, many, chosen, several):
+    for one in (fit, many, chosen):
         assert type(one.circuit) is type(etid.circuit(STRING))
         assert one.circuit.values()[0] == pytest.approx(33.4, rel=1e-6)
         assert one.limits is not None
     np.testing.assert_array_equal(many.circuit.values(), fit.circuit.values())
     np.testing.assert_array_equal(chosen.circuit.values(), fit.circuit.values())
-    free = etid.identify_skin(recording, driver, circuit=STRING)
-    assert (fit.stderr.values() < free.stderr.values()).all()
 
 
 def test_a_circuit_string_is_its_circuit_wherever_a_circuit_is_taken(study):
@@ -103,11 +98,10 @@ def test_all_functions_of_studies_take_the_same_options(study, source, fitted):
     ):
         assert vars(found.settings) == {**asked, "asked_method": method}
         assert found.drivers["calibration",].verdict == "successful"
-    other = source.with_name("joint.h5")
-    command = ["fit", str(source), "-o", str(other), "--joint", "--r-load-tolerance", "0.01"]
+    other = source.with_name("other.h5")
+    command = ["fit", str(source), "-o", str(other), "--method", "maximum_likelihood"]
     assert cli.main([*command, *ON_COMMAND_LINE]) == 0
-    changed = {"asked_method": "joint", "r_load_tolerance": 0.01}
-    assert vars(stored(other)) == vars(stored(fitted)) | changed
+    assert vars(stored(other)) == vars(stored(fitted))
     assert not etid.identify_study(study, order=4).fits.counts().get("successful")
 
 
@@ -127,24 +121,3 @@ def test_files_of_fits_store_the_options_and_older_files_are_read(fitted, tmp_pa
     with h5py.File(older, "r+") as content:
         del content.attrs["plausible"]
     assert stored(older) == dataclasses.replace(settings, plausible=PLAUSIBLE)
-
-
-def test_a_run_of_another_range_of_drivers_is_not_resumed(source, tmp_path, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(files, "identify_part", interrupted)
-    target = tmp_path / "fits.h5"
-    with pytest.raises(KeyboardInterrupt):
-        etid.fit_file(source, target, plausible=(0.0, np.inf))
-    with pytest.raises(files.ResumeError, match="another plausible;"):
-        etid.fit_file(source, target, resume=True)
-    with pytest.raises(KeyboardInterrupt):
-        etid.fit_file(source, target, plausible=(0.0, np.inf), resume=True)
-
-
-def test_equal_options_are_one_key_whatever_numbers_the_circuit_has():
-    """A worker keeps its drivers by them; a circuit of arrays has no hash."""
-    arrays = Options.of([etid.SkinRC(r_s=np.asarray(1e3))], order=4)
-    assert {arrays: "kept"}[Options.of([etid.SkinRC()], order=4)] == "kept"
-    assert arrays != Options.of([etid.SkinRC()], order=5)

@@ -52,17 +52,6 @@ def test_the_slope_of_a_spread_relaxation_is_that_of_its_asymmetry():
     np.testing.assert_allclose(slope, expected, rtol=1e-7)  # step², and rounding over step
 
 
-def test_relaxations_are_in_units_of_the_impedance_at_their_corner():
-    f = np.geomspace(60.0, 1e5, 30)
-    circuit = etid.SkinRC(33e3, 186e3, 0.12e-9)
-    _, (_, *found) = other_circuit.changes(circuit.impedance(), jnp.asarray(f))
-    assert len(found) == other_circuit.GRID
-    corners = np.geomspace(30.0, 2e5, other_circuit.GRID)
-    for corner, change in zip(corners, found, strict=True):
-        level = abs(33e3 + 186e3 / (1 + 2j * np.pi * corner * 186e3 * 0.12e-9))
-        np.testing.assert_allclose(change, level / (1 + 1j * f / corner), rtol=1e-9)
-
-
 def scores(residual, rows, jacobian):
     """Without priors, in white noise of known size."""
     q = jacobian.shape[0]
@@ -130,12 +119,6 @@ def test_a_change_that_hardly_matters_is_none(change):
         assert bool(Scores.of(found).seen()) == (factor > 1)
 
 
-def test_a_load_without_a_capacitor_has_no_phase_to_be_constant():
-    rng = np.random.default_rng(5)
-    rows = np.zeros((2, 50))
-    assert not Scores.of(scores(rng.normal(size=50), rows, rng.normal(size=(3, 50)))).seen()
-
-
 def test_a_relaxation_that_the_circuit_has_is_none():
     """What is left of its direction is rounding, whose score would be any number."""
     f = np.geomspace(60.0, 1e5, 200)
@@ -161,16 +144,6 @@ def identified(load, snr_db, circuit=None, method=None):
     return etid.identify_skin(study["skin"], driver, circuit=circuit, method=method, throw=False)
 
 
-@pytest.mark.slow
-def test_two_layers_are_no_cole_relaxation_where_chi2_does_not_show_it():
-    """R_s is 10 standard errors off, χ² 1.02."""
-    load = etid.SkinLayers(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
-    fit = identified(load, 40.0, etid.SkinCole())
-    assert fit.chi2 < 1.5
-    assert abs(fit.circuit.values()[0] - 33.4e3) > 5 * fit.stderr.values()[0]
-    assert fit.verdict == "misfit"
-
-
 @pytest.mark.parametrize("load", [Cole(LOADS["dry"], 0.9), TwoLayers(LOADS["damp"], 0.05)])
 def test_another_skin_is_a_misfit_where_chi2_does_not_show_it(load):
     """R_s of these is 24 and 10 % off."""
@@ -194,19 +167,6 @@ def test_a_resistor_fitted_to_skin_is_a_misfit_where_chi2_does_not_show_it():
 
 def test_a_resistor_itself_is_none():
     assert identified(etid.scenes.ResistorLoad(55.2e3), 60.0, Resistor()).verdict == "successful"
-
-
-@pytest.mark.slow
-def test_the_non_parametric_method_sees_another_skin_where_chi2_does_not_show_it():
-    fit = identified(TwoLayers(LOADS["damp"], 0.05), 40.0, method="non_parametric")
-    assert fit.chi2 < 1.5
-    assert fit.verdict == "misfit"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("snr_db", [50.0, 60.0])
-def test_the_non_parametric_method_sees_none_where_there_is_none(snr_db):
-    assert identified(LOADS["dry"], snr_db, method="non_parametric").verdict == "successful"
 
 
 def test_a_wrong_gain_is_seen_where_it_moves_r_p_by_a_quarter():

@@ -17,7 +17,6 @@ from etid.estimators.output_error.fit import fit_source
 from etid.estimators.output_error.information import (
     Slopes,
     curvature,
-    inverse,
 )
 from etid.estimators.output_error.prediction import (
     IMPULSE,
@@ -27,7 +26,6 @@ from etid.estimators.output_error.prediction import (
     prepare,
 )
 from etid.estimators.registry import OUTPUT_ERROR
-from etid.estimators.sandwich import Curvature
 from etid.identify.fitting import skin
 from etid.recordings.preflight import Inspected
 from etid.results.driver import SourceImpedance
@@ -68,10 +66,7 @@ def plain(resistance):
 
 @pytest.mark.parametrize("z_load", [pytest.param(20e3, marks=pytest.mark.slow), 300e3])
 def test_a_late_calibration_is_an_excess_impedance_and_a_delay(z_load):
-    """−G sτ ((R_L − Z_L) / (Z_L + R) + 1) of V_th, a sine, all of them resistors.
-
-    The second part is a delay, which is fitted besides.
-    """
+    """−G sτ ((R_L − Z_L) / (Z_L + R) + 1) of V_th, a sine, all of them resistors."""
     r_load, r, omega = 98.8e3, 15e3, 0.2
     records = prepared(measurement(jnp.sin(omega * jnp.arange(400.0))))
     load = resistor(jnp.asarray(z_load)).rational()
@@ -114,25 +109,6 @@ def test_the_noise_of_a_record_is_no_information():
         score += sigma**2 * moved @ moved.T / s
     score += np.diag(precision)  # what is drawn from its prior
     np.testing.assert_allclose(found.score, score, rtol=1e-9, atol=1e-9 * np.abs(score).max())
-
-
-def test_nuisances_are_projected_out():
-    rng = np.random.default_rng(4)
-    j, noise = rng.normal(size=(40, 5)), rng.uniform(1, 2, 40)
-    of = Curvature(jnp.asarray(j.T @ j), jnp.asarray((j.T * noise) @ j))
-    found = of.eliminate(2)
-    full = np.linalg.inv(j.T @ j)
-    np.testing.assert_allclose(np.linalg.inv(found.expected), full[:2, :2], rtol=1e-9)
-    sandwich = full @ ((j.T * noise) @ j) @ full
-    small = np.linalg.inv(found.expected)
-    np.testing.assert_allclose(small @ found.score @ small, sandwich[:2, :2], rtol=1e-9)
-
-
-def test_what_is_not_known_has_an_enormous_variance_or_no_effect():
-    known = np.diag([4.0, 0.0])
-    np.testing.assert_allclose(inverse(jnp.asarray(known))[0, 0], 0.25)
-    assert float(inverse(jnp.asarray(known))[1, 1]) > 1e9
-    assert float(inverse(jnp.asarray(known), drop=True)[1, 1]) == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -199,39 +175,17 @@ def test_errors_of_a_driver_that_misses_its_calibration_are_as_large_as_it_does(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("sample_rate", "snr_db", "worst"), [(100e3, 80.0, 5), (100e3, 60.0, 3.5), (150e3, 80.0, 4)]
-)
-def test_a_sample_rate_that_is_too_low_for_the_interpolation_is_told(sample_rate, snr_db, worst):
-    """chi2 does not show it: it is 4.5, 1.2 and 1.3. The elements are 9, 5 and 6 errors off."""
-    fit = _in_time(sample_rate, snr_db, seed=1)
-    off = (np.array(fit.circuit.values()) - _values(LOADS["dry"])) / np.array(fit.stderr.values())
-    assert np.max(np.abs(off)) > worst
-    assert fit.verdict == "biased"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("sample_rate", "snr_db"), [(200e3, 80.0), (150e3, 50.0)])
-def test_a_sample_rate_that_suffices_is_not_blamed(sample_rate, snr_db):
-    fit = _in_time(sample_rate, snr_db, seed=1)
-    off = (np.array(fit.circuit.values()) - _values(LOADS["dry"])) / np.array(fit.stderr.values())
-    assert np.max(np.abs(off)) < 4  # standard errors; three elements
-    assert fit.verdict == "successful"
-
-
-@pytest.mark.slow
-def test_the_rrse_is_that_of_the_noise():
-    """The delay of the calibration is large here: its first order depends on where it is taken."""
-    fit = _in_time(125e3, 40.0, seed=0)
-    assert 0.9 < fit.chi2 < 1.1
-    assert fit.rrse < 0.02  # noise of 1 % in both records; it was 5 from another point
-
-
-def _in_time(sample_rate, snr_db, seed):
+    ("sample_rate", "snr_db", "verdict"),
+    [(100e3, 80.0, "biased"), (100e3, 60.0, "biased"), (150e3, 80.0, "biased"),
+     (200e3, 80.0, "successful"), (150e3, 50.0, "successful")],
+)  # fmt: skip
+def test_a_sample_rate_that_is_too_low_for_the_interpolation_is_told(sample_rate, snr_db, verdict):
+    """χ² does not show it."""
     samples = round(0.05 * sample_rate) + 1
-    study = rung("dry", snr_db=snr_db, sample_rate=sample_rate, samples=samples).simulate(seed)
-    driver = etid.identify_driver(study[CALIBRATION], method="output_error")
-    return etid.identify_skin(study[TRIAL], driver, method="output_error", throw=False)
-
-
-def _values(load):
-    return np.array([load.r_s, load.r_p, load.c_p])
+    of = rung("dry", snr_db=snr_db, sample_rate=sample_rate, samples=samples).simulate(1)
+    driver = etid.identify_driver(of[CALIBRATION], method="output_error")
+    fit = etid.identify_skin(of[TRIAL], driver, method="output_error", throw=False)
+    truth = np.array(dataclasses.astuple(LOADS["dry"]))
+    off = np.abs(np.array(fit.circuit.values()) - truth) / np.array(fit.stderr.values())
+    assert off.max() > 3.5 if verdict == "biased" else off.max() < 4
+    assert fit.verdict == verdict

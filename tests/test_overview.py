@@ -13,12 +13,11 @@ import pytest
 import etid
 from etid.circuits.display import quantity
 from etid.circuits.overview import ROWS, Overview
-from etid.online.state import ElectrodeState, TrackerState
 from etid.recordings.remarks import Remark
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
 from etid.results.fit import Support
 from etid.results.fits_columns import described
-from etid.results.verdicts import message, verdict, verdicts_of
+from etid.results.verdicts import verdict
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
 from tests import kept_numbers
@@ -77,35 +76,6 @@ def study():
     return etid.Study.from_recordings([calibration, etid.Recording(volts, volts, **rates, **known)])
 
 
-def state():
-    own, eye = jnp.broadcast_to(jnp.zeros(4), (2, 4)), jnp.broadcast_to(jnp.eye(3), (2, 3, 3))
-    numbers, two = jnp.array([5, 6]), jnp.array([1.5, 2.5])
-    result = jax.tree.map(jnp.asarray, verdicts_of(np.array(["successful", "flat"])))
-    lanes = ElectrodeState(
-        own=own,
-        information=eye,
-        pulses=numbers,
-        missed=numbers,
-        amplitude=two,
-        offset=two,
-        shown=jnp.stack([two, two], axis=-1),
-        gain=own[:, 1:],
-        confirmed=two,
-        level=two,
-        variance=two,
-        chi2=two,
-        rrse=two,
-        result=result,
-        mean=own[:, 1:],
-        mean_cov=eye,
-        event=numbers,
-        factor=own[:, 1:],
-        element=numbers,
-        drifted=numbers,
-    )
-    return TrackerState(lanes, jnp.array(7), jnp.array(True), jnp.array(True))
-
-
 def found_driver():
     """A driver that says all it can: known resistors that disagree, a drift, a remark, a misfit."""
     of = driver()
@@ -161,7 +131,6 @@ SHOWN = {
         ["Candidate SkinRC", "100.0 %", "r_s 33.40 ± 0.10 kΩ"],
     ),
     "bound": (lambda: Bound("s01", DRY, 1e-4 * np.eye(3)), ["r_s 33.4 kΩ ± 1 %"]),
-    "state": (state, ["State of 2 electrodes", "1 flat, 1 successful", "1 flat 6 6 2.5"]),
 }
 
 
@@ -173,15 +142,6 @@ def test_numbers_have_units_and_no_array_is_printed(make, texts):
         assert [text for text in texts if text not in shown] == []
         assert not ARRAYS.search(shown)
     assert str(one) == one._overview().text()
-
-
-def test_texts_are_those_of_before():
-    """Of the results, without the sentence that explains a verdict."""
-    results = ("fit", "changed fit", "driver", "driver with findings", "batch", "fits")
-    texts = {name: str(SHOWN[name][0]()) for name in results}
-    texts["changed fit"] = texts["changed fit"].replace(message("changed"), "")
-    texts["driver with findings"] = texts["driver with findings"].replace(message("misfit"), "")
-    kept_numbers.check("texts", {name: kept_numbers.Number(text) for name, text in texts.items()})
 
 
 def test_tables_of_fits_are_those_of_before():
@@ -204,28 +164,6 @@ def test_tables_of_fits_are_those_of_before():
         numbers[f"{name}_interval"] = kept_numbers.Number(np.array(ends))
     numbers["correlation"] = kept_numbers.Number(many.fit.correlation)
     kept_numbers.check("tables", numbers)
-
-
-def test_what_a_driver_computes_is_as_before():
-    of, f = found_driver(), jnp.array([600.0, 2e4])
-    load = DRY.response(f)
-    numbers = {
-        "order": of.order,
-        "r_known": of.r_known,
-        "late_std": of.late_std(jnp.asarray(50e3)),
-        "drift_std": of.drift_std(),
-        "later_cov": jnp.diagonal(of.later_cov()),
-        "gain": of.gain(load, f),
-        "sensitivity": of.sensitivity(load, f),
-        "log_response_stderr": of.log_response_stderr(f),
-        "response_stderr": of.response_stderr(f),
-    }
-    kept_numbers.check(
-        "driver", {name: kept_numbers.Number(value) for name, value in numbers.items()}
-    )
-    assert driver().later_cov() is driver().cov or (driver().later_cov() == driver().cov).all()
-    np.testing.assert_allclose(of.drift_std()[3], 0.02 * 1e3)  # a gain changes in proportion
-    np.testing.assert_allclose(of.drift_std()[0], 0.02)  # a logarithm by as much
 
 
 @pytest.mark.parametrize("make", [make for make, _ in SHOWN.values()], ids=SHOWN)
@@ -254,7 +192,7 @@ def test_a_long_table_is_cut():
     assert "… and 40 more" in Overview("numbers", rows[:ROWS], count=ROWS + 40).text()
 
 
-@pytest.mark.parametrize("make", [fit, lambda: fit().circuit, driver, state])
+@pytest.mark.parametrize("make", [fit, lambda: fit().circuit, driver])
 def test_what_jax_traces_or_maps_can_be_shown(make):
     seen = []
 
@@ -271,10 +209,6 @@ def test_what_jax_traces_or_maps_can_be_shown(make):
     assert all(
         type(one).__name__ in text or text == "None" for text in seen if "SkinRC" not in text
     )
-
-
-def test_an_undetermined_bound_says_what_to_do():
-    assert "do not determine r_s" in repr(Bound("s01", DRY, np.diag([2.0, 1e-4, 1e-4])))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import etid
 from benchmarks.ladder import CALIBRATION, rung
 from etid.circuits.elements import Exponent, Ohm, PseudoCapacitance
 from etid.identify.predict import periodic_voltage
-from etid.results.verdicts import verdict
 from etid.simulation.scenes import Trial
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
@@ -67,38 +66,6 @@ def test_elements_are_found_from_typical_values_nearly_as_well_as_possible(study
     assert (stderr < EFFICIENT * smallest).all()
 
 
-@functools.cache
-def calibrated(seed):
-    """A draw and its driver, for all circuits."""
-    drawn = scene().simulate(1000 + seed)
-    return drawn, etid.identify_driver(drawn[CALIBRATION])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", ["layers", "spread"])
-def test_intervals_hold_the_truth_as_often_as_they_say(path):
-    """A calibration for each of 40 draws, so that all are independent."""
-    truth, draws = TRIALS[path], 40
-    inside = []
-    for seed in range(draws):
-        drawn, known = calibrated(seed)
-        fit = etid.identify_skin(drawn[path], known, circuit=type(truth)())
-        error = np.asarray(fit.circuit.values() - truth.values())
-        inside.append(np.abs(error) < 1.96 * np.asarray(fit.stderr.values()))
-    assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / draws)).all()
-
-
-@pytest.mark.slow
-def test_a_joint_fit_takes_any_circuit():
-    trials = tuple(Trial(f"skin/{i}", SPREAD) for i in range(2))
-    fits = etid.identify_jointly(
-        dataclasses.replace(scene(), trials=trials).simulate(3), circuit=etid.SkinCole()
-    ).fits
-    assert fits.counts() == {"successful": 2}
-    error = np.asarray(fits.circuit.values()) - np.asarray(SPREAD.values())
-    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
-
-
 def test_simulated_loads_and_their_truth_are_those_of_the_circuit(study):
     assert scene().truth()["spread"] == pytest.approx(
         {"r_s": 33.4e3, "r_p": 186e3, "tau": 22e-6, "alpha": 0.85}, rel=1e-15
@@ -116,19 +83,6 @@ def test_simulated_loads_and_their_truth_are_those_of_the_circuit(study):
 def test_one_relaxation_of_two_is_seen(study, driver):
     fit = etid.identify_skin(study["layers"], driver, throw=False)
     assert fit.verdict in ("misfit", "inconsistent")
-
-
-@pytest.mark.slow
-def test_a_second_layer_that_is_not_there_is_insensitive(study, driver):
-    fit = etid.identify_skin(study["dry"], driver, circuit=etid.SkinLayers(), throw=False)
-    assert fit.verdict == "insensitive"
-
-
-@pytest.mark.slow
-def test_a_spread_that_is_not_there_is_an_exponent_of_one(study, driver):
-    fit = etid.identify_skin(study["dry"], driver, circuit=etid.SkinCole())
-    off = np.abs(np.asarray(fit.circuit.values()) / [33.4e3, 186e3, 186e3 * 0.12e-9, 1.0] - 1)
-    assert (off < SIGMAS * np.asarray(fit.stderr.values() / fit.circuit.values())).all()
 
 
 def test_a_prediction_by_periods_has_the_delays_of_the_record():
@@ -156,31 +110,6 @@ def test_a_fit_predicts_its_record_down_to_the_noise(study, driver):
     assert np.std(rest) < 1.5 * noise  # both records have it
 
 
-def test_a_fit_prints_its_units():
-    cov = np.diag([1e4, 1e6, 1e-14, 1e-6])
-    zero = np.zeros(())
-    quality = {"rrse": zero, "chi2": zero, "steps": zero.astype(int)}
-    covs = {"cov": cov, "shared_cov": cov}
-    fit = etid.Fit(circuit=SPREAD, result=verdict("successful"), method="m", **covs, **quality)
-    lines = str(fit).splitlines()
-    assert lines[1:] == [
-        "  r_s     33.40 ± 0.10    kΩ",
-        "  r_p     186.0 ± 1.0     kΩ",
-        "  tau     22.00 ± 0.10    µs",
-        "  alpha  0.8500 ± 0.0010",
-    ]
-
-
-# --- refusals -------------------------------------------------------------------------------------
-
-
-def test_a_method_that_cannot_says_which_can(study, driver):
-    with pytest.raises(ValueError, match="identifies SkinRC only"):
-        etid.identify_skin(
-            study["spread"], driver, circuit=etid.SkinCole(), method="steiglitz_mcbride"
-        )
-
-
 @pytest.mark.slow
 def test_a_constant_phase_is_identified_and_predicted_in_less_than_a_period(driver):
     short = scene(samples=3_000).simulate(3)["spread"]
@@ -191,9 +120,6 @@ def test_a_constant_phase_is_identified_and_predicted_in_less_than_a_period(driv
     noise = 10 ** (-60 / 20) * np.std(short.v_th)
     rest = etid.predict(short, driver, SPREAD) - short.v_out
     assert np.nanstd(rest) < 1.5 * noise  # both records have it
-
-
-# --- from impedances ------------------------------------------------------------------------------
 
 
 def measured(circuit, seed, sigma=100.0):

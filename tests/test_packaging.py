@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 import tomllib
-import types
 
 import pytest
 import yaml
@@ -75,11 +74,6 @@ def test_the_conda_recipe_says_what_the_project_says(project):
     assert [named.get(name, name) + bound for name, _, bound in needed] == project["dependencies"]
 
 
-def test_types_are_shipped(project):
-    assert (ROOT / "etid" / "py.typed").is_file()
-    assert "Typing :: Typed" in project["classifiers"]
-
-
 def test_dependencies_have_lower_bounds_and_exact_versions_in_the_constraints(project):
     pinned = {
         line.split("==")[0].lower().replace("_", "-")
@@ -109,10 +103,3 @@ assert not slow & set(sys.modules), "scipy loads its parts when they are used: i
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
-def test_dir_shows_the_public_names_and_no_module():
-    shown = dir(etid)
-    assert shown == sorted(etid.__all__)
-    modules = {name for name in shown if isinstance(getattr(etid, name), types.ModuleType)}
-    assert modules == {"scenes"}  # `etid.scenes.paper_skins()` is how its functions are called

@@ -15,7 +15,7 @@ from etid.estimators.lanes import Harmonics
 from etid.plotting import figure_of
 from etid.plotting.bands import CLEAR, bands
 from etid.plotting.pulses import pulse, residual_std
-from etid.plotting.style import RED, new_figure, save
+from etid.plotting.style import RED
 from etid.recordings.preflight import Inspected
 from tests import pictures
 
@@ -62,22 +62,6 @@ def test_a_recording_is_shown_whole_and_by_one_pulse(recording):
     assert "typical/dry/01" in whole.get_title(loc="left")
 
 
-def test_a_current_is_shown_below_the_voltages_over_the_same_time():
-    recording = pictures.with_current()
-    amperes = recording.samples["current"].values
-    voltage, one, current, one_current = figure_of(recording).axes
-    names = [r"$V_\mathrm{th}$", r"$V_\mathrm{out}$"]
-    assert [line.get_label() for line in one.lines] == names
-    assert current.get_ylabel() == one_current.get_ylabel() == "current [mA]"
-    np.testing.assert_allclose(np.asarray(current.lines[0].get_ydata()), 1e3 * amperes)
-    assert voltage.get_shared_x_axes().joined(voltage, current)
-    assert one.get_shared_x_axes().joined(one, one_current)
-    alone = recording.without_v_th().replace(current=1e-6 * amperes)  # as of a patch clamp
-    _, one, current, _ = figure_of(alone).axes
-    assert [line.get_label() for line in one.lines] == names[1:]
-    assert current.get_ylabel() == "current [pA]"
-
-
 def test_one_pulse_of_two_phases_is_shown_from_its_beginning():
     """Its largest step is between the phases, and twice as large as the first."""
     current = np.zeros(10_000)
@@ -95,15 +79,6 @@ def test_one_pulse_of_two_phases_is_shown_from_its_beginning():
         assert current[part].sum() == 0
         assert np.abs(current[part]).sum() == pytest.approx(80e-3)
     assert shown(current[120:]).start > 3000  # this record begins in a pulse
-
-
-def test_the_legend_of_a_residual_is_above_its_axes(recording, driver):
-    figure = figure_of(pictures.fit(), recording, driver)
-    figure.draw_without_rendering()
-    lower = figure.axes[1]
-    legend = lower.get_legend()
-    assert legend is not None
-    assert legend.get_window_extent().y0 >= lower.get_window_extent().y1 - 1  # [pixel]
 
 
 def test_a_fit_shows_its_residual_in_millivolts_in_a_band_of_two_sigma(recording, driver):
@@ -201,17 +176,6 @@ def test_a_selection_shows_what_is_measured_and_each_candidate(driver, found):
     assert "alpha" in title
 
 
-def test_a_selection_without_success_or_elements_says_so(driver):
-    both = {"SkinRC": "misfit", "SkinCole": "misfit"}
-    selection = pictures.selection(**both)
-    magnitude, *_ = figure_of(selection, pictures.spread(), driver).axes
-    assert "no success: misfit" in magnitude.get_title(loc="left")
-    empty = pictures.fit("too_short", pictures.SKIN.with_log_values(jnp.full(3, jnp.nan)))
-    nothing = etid.Selection.of({0: empty}, 0, [pictures.SKIN])
-    magnitude, *_ = figure_of(nothing, pictures.spread(), driver).axes
-    assert [text.get_text() for text in magnitude.texts] == ["no elements"]
-
-
 def test_an_impedance_is_in_kilohms_and_degrees_in_a_band_of_two_standard_errors(driver):
     magnitude, phase = figure_of({"Z_th": driver}).axes
     kilohertz, size = (np.asarray(of, float) for of in magnitude.lines[0].get_data())
@@ -286,13 +250,6 @@ def test_a_bound_shows_per_cent_and_what_is_undetermined():
     assert len(figure_of(pictures.bounds()["noisy"]).axes) == 1
 
 
-def test_given_axes_are_drawn_on_and_returned(driver):
-    _, axes = new_figure(2, 2, (6.0, 5.0))
-    drawn = etid.plot(driver, axes=axes[:, 1])
-    assert list(drawn) == list(axes[:, 1])
-    assert not axes[0, 0].lines
-
-
 def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, monkeypatch):
     import matplotlib.pyplot as plt
 
@@ -304,28 +261,6 @@ def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, 
     [new] = set(plt.get_fignums()) - set(before)
     assert plt.figure(new) is axes[0].figure
     plt.close(new)
-
-
-def test_equal_figures_are_equal_files(recording, tmp_path):
-    figures = [figure_of(recording) for _ in range(2)]
-    for suffix in (".png", ".svg"):
-        files = [tmp_path / f"{i}{suffix}" for i in range(2)]
-        for figure, file in zip(figures, files, strict=True):
-            save(figure, file)
-        if suffix == ".png":
-            assert files[0].read_bytes() == files[1].read_bytes()
-        assert b"<dc:date>" not in files[0].read_bytes()
-
-
-def test_a_fit_is_shown_beside_the_impedance_that_is_measured(recording, driver):
-    nyquist, magnitude, phase = figure_of(pictures.fit(), recording, driver, show="impedance").axes
-    re, im = (np.asarray(of, float) for of in nyquist.lines[1].get_data())
-    size = np.asarray(magnitude.lines[1].get_ydata(), float)
-    np.testing.assert_allclose(np.hypot(re, im), size, rtol=1e-12)
-    kilohertz, angle = (np.asarray(of, float) for of in phase.lines[1].get_data())
-    z = np.asarray(pictures.SKIN.response(jnp.asarray(1e3 * kilohertz))) / 1e3
-    np.testing.assert_allclose(size, np.abs(z), rtol=0.2)
-    np.testing.assert_allclose(angle, np.degrees(np.angle(z)), atol=12)
 
 
 def _segments(axis):

@@ -46,7 +46,6 @@ def _example():
         "f_c": fit.circuit.f_c,
         "logarithms": fit.circuit.log_values(),
         "profile": fit.profile("c_p").interval(),
-        "draws": fit.posterior(draws=20).intervals(),
         "predicted": etid.predict(study["a"], driver, fit.circuit),
         "fits": fits.fit,
         "one of them": fits[1],

@@ -14,7 +14,7 @@ from etid.identify.planning import explained
 from etid.recordings.causes import why_misaligned
 from etid.recordings.preflight import SHORTEST, Inspected
 from etid.recordings.preflight import preflight as of_inspected
-from etid.simulation.scenes import PRESETS, Scene, Trial
+from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
 
 LENGTH = 3334
@@ -35,15 +35,8 @@ def recording():
     return simulate()
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS))
-@pytest.mark.parametrize("snr_db", [None, 60.0, 30.0])
-def test_every_paper_recording_passes(name, snr_db):
-    study = PRESETS[name](samples=LENGTH, snr_db=snr_db).simulate(seed=0)
-    assert {path: preflight(r) for path, r in study.items() if preflight(r)} == {}
-
-
-@pytest.mark.parametrize("bits", [8, 10, 12, 16, None])
-@pytest.mark.parametrize("sample_rate", [100e3, 200e3, 500e3, 1e6])
+@pytest.mark.parametrize("bits", [8, 12, None])
+@pytest.mark.parametrize("sample_rate", [100e3, 500e3])
 def test_coarse_converters_and_every_rate_pass(bits, sample_rate):
     """The top of a pulse falls on few codes of a coarse converter, and is no clipping."""
     for snr_db in (None, 60.0):
@@ -53,21 +46,17 @@ def test_coarse_converters_and_every_rate_pass(bits, sample_rate):
 
 
 @given(
-    r_s=st.floats(1e3, 100e3),
-    r_p=st.floats(10e3, 1e6),
-    c_p=st.floats(30e-12, 2e-9),
+    load=st.one_of(
+        st.builds(SkinLoad, st.floats(1e3, 1e5), st.floats(1e4, 1e6), st.floats(30e-12, 2e-9)),
+        st.builds(ResistorLoad, st.floats(1e3, 1e6)),
+    ),
     jitter=st.sampled_from([0.0, 1e-6]),
+    snr_db=st.sampled_from([None, 60.0, 30.0]),
     seed=st.integers(0, 99),
 )
-def test_any_skin_passes(r_s, r_p, c_p, jitter, seed):
+def test_any_load_passes(load, jitter, snr_db, seed):
     """Wider than the paper's ten subjects, dry and damp, with a sloppy trigger."""
-    one = simulate(SkinLoad(r_s, r_p, c_p), seed, trigger_jitter_rms=jitter)
-    assert preflight(one) is None
-
-
-@pytest.mark.parametrize("r", [1e3, 21.62e3, 555e3, 10e6])
-def test_any_resistor_passes(r):
-    assert preflight(simulate(ResistorLoad(r))) is None
+    assert preflight(simulate(load, seed, snr_db=snr_db, trigger_jitter_rms=jitter)) is None
 
 
 def test_reference_recordings_pass_but_the_clipped_ones(reference_data, tmp_path):
@@ -101,12 +90,6 @@ def test_what_is_broken_is_named(recording, which, change, name):
     assert preflight(broken) == name
 
 
-def test_numbers_whose_differences_overflow_are_not_finite(recording):
-    """And no warning is raised."""
-    huge = np.where(np.arange(LENGTH) % 2, 1e308, -1e308)
-    assert preflight(recording.replace(v_th=huge, v_out=huge)) == "nonfinite_samples"
-
-
 def test_a_single_sample_at_the_known_rail_is_saturated(recording):
     v = recording.v_out
     assert preflight(recording.replace(v_out=v, adc_range=(-200.0, v.max()))) == "saturated"
@@ -130,11 +113,6 @@ def test_the_cause_of_misaligned_records_is_named(recording, change, words):
     assert explained(Inspected(changed), "misaligned").startswith(why)
 
 
-def test_swapped_records_are_misaligned(recording):
-    swapped = recording.replace(v_th=recording.v_out, v_out=recording.v_th)
-    assert preflight(swapped) == "misaligned"
-
-
 def test_the_shortest_record_is_named_before_anything_else():
     one = simulate(samples=SHORTEST)
     assert preflight(one) is None
@@ -142,17 +120,10 @@ def test_the_shortest_record_is_named_before_anything_else():
     assert preflight(one.replace(v_th=nothing, v_out=nothing)) == "too_short"
 
 
-@pytest.mark.parametrize("snr_db", [None, 80.0, 60.0, 40.0, 20.0])
-@pytest.mark.parametrize("jitter", [0.0, 50e-9, 500e-9])
+@pytest.mark.parametrize("snr_db", [None, 60.0, 20.0])
+@pytest.mark.parametrize("jitter", [0.0, 500e-9])
 def test_a_record_without_a_load_is_unconnected(snr_db, jitter):
     options = {"snr_db": snr_db, "trigger_jitter_rms": jitter, "offset_rms": 0.01}
     assert preflight(simulate(OpenLoad(), **options)) == "unconnected"
     one = simulate(**options)
     assert preflight(one.replace(v_out=one.v_th)) == "unconnected"
-
-
-@pytest.mark.parametrize("snr_db", [None, 60.0, 40.0, 20.0])
-def test_a_load_of_megohms_is_connected(snr_db):
-    """It draws a hundredth of what the terminal has: ten and more standard errors at 20 dB."""
-    for r in (200e3, 1e6):
-        assert preflight(simulate(ResistorLoad(r), snr_db=snr_db)) is None

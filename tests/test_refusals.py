@@ -42,6 +42,8 @@ etid.identify_skin(of.skin, of.driver, circuit=etid.Resistor(), method='equation
     -> identifies SkinRC only
 etid.predict(of.skin, of.driver) -> give the circuit
 skin(of, method='steiglitz_mcbride') -> steiglitz_mcbride.*from a measured current
+etid.identify_skin(of.skin, of.driver, circuit='auto', method='non_parametric')
+    -> computes no likelihood
 skin(of, method='non_parametric') -> non_parametric.*from a measured current
 etid.identify_skin(of.skin, of.driver, method=WITH_CURRENT) -> needs a driver and a current
 etid.identify_skin(of.both, method=WITH_CURRENT) -> needs a driver and a current

@@ -1,7 +1,5 @@
 """Tables and pages, and the arithmetic of the demo's tables."""
 
-import csv
-import dataclasses
 import html.parser
 import re
 
@@ -10,23 +8,12 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks import paper
-from benchmarks.__main__ import asked
 from etid.paper import demo, tables
 from etid.report import html as report
 from etid.results.driver import DiscreteDriver
 from etid.results.verdicts import verdict, verdicts_of
 
 EXCESS = 1.1  # of every identified element over the true one
-
-
-def test_table_sets_words_left_and_numbers_right():
-    table = report.Table(("name", "value", "verdict"), (("a", "1.5", "flat"), ("bc", "", "ok")))
-    assert str(table).splitlines() == [
-        "name  value  verdict",
-        "a       1.5  flat",
-        "bc           ok",
-    ]
 
 
 @pytest.mark.parametrize(
@@ -142,98 +129,3 @@ def test_demo_tables_show_the_error_that_was_made(outcome):
     assert built[2:] == ("10.00 / 0.00",) * 3 + ("5.00", "12/23")
     verdicts = demo.table_verdicts([outcome], truth).rows[0]
     assert verdicts[2:] == ("successful", "72 successful, 71 misfit", *("100 %",) * 3)
-
-
-# --- the paper's tables by cause (benchmarks/paper.py) --------------------------------------------
-
-
-@pytest.fixture
-def groups(outcome):
-    """Two studies whose elements are 10 and 30 % too large."""
-    return {("good", "output_error"): [outcome, _outcome(1.3)]}
-
-
-def test_tables_tell_errors_of_studies_from_scatter_of_trials(groups):
-    truth = etid.scenes.paper().truth()
-    between = np.sqrt(200.0)  # standard deviation of 10 and 30
-    for row in paper.table_1(groups):
-        assert (row["circuits"], row["fits"]) == (2, 2)
-        found = [row[name] for name in ("error", "spread", "rms")]
-        np.testing.assert_allclose(found, [20.0, between, np.sqrt(500.0)])
-    rows = paper.table_4(groups, truth)
-    assert [row["element"] for row in rows] == ["r_p", "c_p", "r_s"]
-    for row in rows:
-        assert (row["circuits"], row["successful"], row["studies"]) == (46, 24, 2)
-        found = [row[name] for name in ("error", "between", "scatter", "rrse")]
-        np.testing.assert_allclose(found, [20.0, between, 0.0, 5.0], atol=1e-9)
-        # every fit has an error of 100 %, nothing is shared, and a study has 23 trials
-        assert row["stderr"] == pytest.approx(100 * 1.2 / np.sqrt(23))
-
-
-def _without(fits, rows):
-    """The same fits, of which some found no circuit."""
-    values = {name: np.array(getattr(fits.circuit, name)) for name in fits.circuit.names()}
-    for column in values.values():
-        column[rows] = np.nan
-    circuit = type(fits.circuit)(**values)
-    return dataclasses.replace(fits, fit=dataclasses.replace(fits.fit, circuit=circuit))
-
-
-def test_fits_without_a_circuit_are_counted_and_left_out(outcome):
-    truth = etid.scenes.paper().truth()
-    lost = outcome.skins.labels["path"] == "built/01"
-    some = dataclasses.replace(outcome, skins=_without(outcome.skins, lost))
-    groups = {("good", "output_error"): [some]}
-    for row in paper.table_4(groups, truth):
-        assert (row["circuits"], row["fits"]) == (22, 23)
-        assert row["error"] == pytest.approx(10.0)
-
-
-def test_tables_by_cause_print_numbers_beside_those_of_the_paper(groups):
-    truth = etid.scenes.paper().truth()
-    first, fourth = (columns for *_, columns in paper.TABLES)
-    table = paper.show(paper.table_1(groups), first)
-    assert table.rows[0] == ("good", "output_error", "21.62 kΩ", "4.26", "20.00", "14.14", "2", "2")
-    table = paper.show(paper.table_4(groups, truth), fourth)
-    assert table.rows[0][2:8] == ("r_p", "2.46", "17.50", "20.00", "0.00", "14.14")
-
-
-def test_each_cause_is_one_change_of_the_good_laboratory():
-    good, both = paper.LABORATORIES["good"], paper.LABORATORIES["both"]
-    default = {"trigger_jitter_rms": 0.0, **good}
-    for name, settings in paper.LABORATORIES.items():
-        changed = [key for key, value in {**default, **settings}.items() if value != default[key]]
-        assert len(changed) == {"good": 0, "both": 2}.get(name, 1)
-    alone = [paper.LABORATORIES[name] for name in ("noise 40 dB", "delays 200 ns")]
-    assert {**alone[1], **alone[0]} == both
-
-
-def test_a_study_has_the_resistors_and_trials_of_the_built_circuit():
-    few, whole = ([t.path for t in paper.scene_of("both", quick).trials] for quick in (True, False))
-    assert (len(few), len(whole)) == (5 + 3, 5 + 23)
-    assert {"resistors/555k", "built/03"} <= {*few}
-
-
-def test_what_is_missed_is_said(groups):
-    truth = etid.scenes.paper().truth()
-    same = {
-        ("good", paper.DEFAULT): groups["good", "output_error"],
-        (paper.OWN_NOISE, paper.DEFAULT): groups["good", "output_error"],
-    }
-    first, fourth = paper.table_1(same), paper.table_4(same, truth)
-    assert [of.met for of in paper.targets(first, fourth)] == [False, True, True, True]
-    for row in fourth:
-        row["stderr"] /= 10.0
-    assert not any(of.met for of in paper.targets(first, fourth))
-
-
-@pytest.mark.slow
-def test_the_papers_tables_and_the_figure_of_causes_are_made(tmp_path, capsys):
-    assert paper.main(asked(["paper", "--quick", "--folder", str(tmp_path)]))
-    for number in (1, 4):
-        with (tmp_path / f"table_{number}.csv").open() as file:
-            rows = list(csv.DictReader(file))
-        assert {row["laboratory"] for row in rows} == set(paper.LABORATORIES)
-        assert {row["source"] for row in rows} == {"simulated"}
-    assert (tmp_path / "table_4.svg").read_text().startswith("<?xml")
-    assert "white noise alone shifts all trials by -28" in capsys.readouterr().out

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 import etid
-from etid.estimators.score_tests import of_calibrations
-from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
@@ -41,19 +39,6 @@ def test_of_two_resistors_one_that_is_5_percent_wrong_is_seen(calibrations, fact
     assert "r_load 216.6 kΩ is " in str(driver)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("which", [0, 1])
-def test_in_noise_of_40_db_one_that_is_5_percent_wrong_is_seen(which):
-    """Chi2 is 1.03 or less."""
-    trials = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(KNOWN))
-    study = Scene(calibration=trials, snr_db=40.0, trigger_jitter_rms=50e-9).simulate(seed=1)
-    records = [study[trial.path] for trial in trials]
-    records[which] = records[which].replace(r_load=1.05 * KNOWN[which])
-    driver = etid.identify_driver(records, throw=False)
-    assert driver.verdict == "resistors_disagree"
-    assert driver.chi2 < 1.5
-
-
 def test_a_resistor_in_kilohm_beside_one_in_ohm_is_seen(calibrations):
     first, second = calibrations
     with pytest.raises(etid.IdentificationError, match="resistors_disagree") as raised:
@@ -72,9 +57,3 @@ def test_a_resistor_of_another_unit_makes_an_implausible_driver(calibrations, r_
         etid.identify_driver(calibration)
     believed = etid.identify_driver(calibration, plausible=(0.0, np.inf))
     assert believed.verdict == "successful"
-
-
-def test_rough_impedances_are_within_the_factor_that_is_allowed(calibrations):
-    rough = [of_calibrations.rough_impedance(Inspected(of), of.r_load) for of in calibrations]
-    assert max(rough) < 1.2 * min(rough)
-    assert 10e3 < min(rough) < 20e3  # |Z_th| is 12.7 kohm at 1 kHz, and rises

@@ -1,7 +1,5 @@
 """Coarse converters: their rounding error is weighed as what it is, and the fit says so."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -49,19 +47,6 @@ def test_a_fine_converter_is_not_coarse(snr_db, bits):
         assert Inspected(as_float(recording)).remarks == Remark(0)
 
 
-@pytest.mark.parametrize(("digits", "coarse"), [(3, True), (4, False)])
-def test_values_of_three_digits_are_those_of_a_coarse_converter(digits, coarse):
-    """Each value has its own step, as in a table that was printed with `%.3g`."""
-    recording = study_of(bits=None)["calibration/98k8"]
-    records = {
-        name: [float(f"{v:.{digits}g}") for v in getattr(recording, name)]
-        for name in ("v_th", "v_out")
-    }
-    seen = Inspected(recording.replace(adc_range=None, **records))
-    assert seen.remarks == (Remark.coarse_converter if coarse else Remark(0))
-    np.testing.assert_allclose(seen.step, 0.1 * coarse)  # of 63.6 V
-
-
 def test_noise_of_any_size_is_seen_through_the_steps():
     rng = np.random.default_rng(1)
     ramp, step = np.linspace(0.0, 7.0, 20_000), 1.0
@@ -102,38 +87,6 @@ def test_the_size_of_the_rounding_error_is_known_at_each_harmonic(samples):
     # One draw of an error of few independent parts, weighed as at most three times as large.
     assert (ratio < 2).all()
     assert (ratio > 0.05).all()
-
-
-def test_neighbouring_harmonics_err_together():
-    """Slow parts of a record have few independent errors, which move many harmonics alike.
-
-    The converter has 16 random offsets, like the waveforms of `rounding_variance`: the mean squares
-    are known to a factor of 1.4.
-    """
-    exact = study_of(bits=None, snr_db=None)["calibration/98k8"].v_out
-    step = 20.0 / 2**8 / scenes.Scene().scale
-    turn = np.exp(-1j * np.angle(harmonics(exact, 3, exact.size)))
-    rng, first, sums = np.random.default_rng(5), [], []
-    for _ in range(16):
-        lifted = exact + step * rng.random()
-        coarse = np.round(lifted / step) * step
-        error = turn * harmonics(coarse - lifted, 3, exact.size)
-        known = noise.rounding_variance(coarse, step, 3, exact.size)
-        first.append(np.abs(error[0]) ** 2 / known[0])
-        # Of 25 harmonics each, of both parts, relative to the variance of independent errors.
-        together = [part[:500].reshape(-1, 25).sum(1) for part in (np.real(error), np.imag(error))]
-        sums.append(2 * np.square(together) / known[:500].reshape(-1, 25).sum(1))
-    assert np.mean(first) < 4  # it was 13
-    assert np.mean(sums, axis=0).max() < 5  # it was 22
-
-
-def test_the_bound_counts_rounding_as_what_it_is():
-    """It was that of white noise of the same power, a fifth of this for R_p."""
-    coarse = Scene(DRY.trials[:1], DRY.calibration, bits=8)
-    fine = dataclasses.replace(coarse, bits=16)
-    r_p, white = (etid.bound(of)[DRY.trials[0].path].relative["r_p"] for of in (coarse, fine))
-    white = white * coarse.waveform().sigma / fine.waveform().sigma
-    assert 2 < r_p / white < 8
 
 
 def test_too_coarse_a_converter_says_so():

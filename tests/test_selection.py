@@ -7,22 +7,17 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks.perturbed_study import PARTS, drawn_driver
-from benchmarks.selection_draws import choices
-from etid.circuits.elements import Farad, Ohm, PseudoCapacitance
-from etid.circuits.impedance import AbstractImpedance
-from etid.estimators.starts import circuit_starts
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
 from etid.results.fit import CHANGES, Fit, Support
 from etid.results.verdicts import verdict
-from etid.selection.common import common, deserves
+from etid.selection.common import common
 from etid.selection.evidence import best, bic, rank, weights, with_close
 from etid.selection.search import search, usual_circuits
 from etid.selection.selection import Selection
 from etid.selection.unseen import WIDTH, hidden, posterior, unseen
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, TransformerDriver
+from etid.simulation.transformer import ResistorLoad
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
@@ -68,9 +63,6 @@ def made(circuit, deviance, name="successful", z=(0.0,) * CHANGES, error=0.01, s
     )
 
 
-# --- Rules ----------------------------------------------------------------------------------------
-
-
 def test_a_richer_circuit_must_pay_for_its_elements():
     skin, richer = made(etid.SkinRC(), 990.0), etid.SkinCole()
     penalty = np.log(TERMS)
@@ -111,33 +103,6 @@ def test_a_phase_of_a_capacitor_is_no_reason_for_a_constant_phase():
     cole = etid.SkinCole(20e3, 100e3, 30e-6, 0.995)
     assert rank(made(cole, 900.0)) == 1
     assert rank(made(dataclasses.replace(cole, alpha=jnp.asarray(0.95)), 900.0)) == 0
-
-
-class Warburg(etid.AbstractCircuit):
-    """A resistor and a diffusion, whose exponent is no parameter."""
-
-    r_s: Ohm = etid.parameter("ohm", typical=20e3)
-    q: PseudoCapacitance = etid.parameter("siemens second^alpha", typical=1e-7)
-
-    def impedance(self) -> AbstractImpedance:
-        """R_s + 1 / (Q √s)."""
-        return etid.series(etid.resistor(self.r_s), etid.constant_phase(self.q, 0.5))
-
-
-def test_an_exponent_that_is_no_parameter_is_one():
-    assert Warburg().exponents() == (0.5,)
-    assert etid.SkinRC().exponents() == ()
-    assert rank(made(Warburg(), 900.0)) == 0
-    assert not unseen(made(Warburg(), 900.0, slope=2.0)).any()
-
-
-def test_weights_are_probabilities_of_what_the_data_allow():
-    fits = {
-        0: made(etid.SkinRC(), 1000.0),
-        1: made(etid.SkinCole(), 1000.0 - np.log(TERMS)),
-        2: made(etid.Resistor(), 1020.0, "misfit"),
-    }
-    assert weights(fits) == pytest.approx({0: 0.5, 1: 0.5, 2: 0.0})
 
 
 def test_the_error_contains_the_difference_to_a_likely_circuit():
@@ -256,12 +221,6 @@ def test_weak_evidence_of_many_recordings_decides_and_that_of_one_does_not():
     assert common([choice(strong), *[choice({0: plain})] * 3], CANDIDATES) == 0
 
 
-def test_a_recording_that_deserves_another_circuit_says_so():
-    selection = choice({0: made(etid.SkinRC(), 1100.0), 3: made(etid.SkinCole(), 1000.0)})
-    assert "supports SkinCole better: 2 log evidence +93" in deserves(selection, 0)
-    assert deserves(selection, 3) == ""
-
-
 @pytest.mark.parametrize(
     ("z", "words"),
     [
@@ -278,20 +237,6 @@ def test_a_residual_looks_like_what_a_passive_circuit_can_make(z, words):
     said = Support(nothing, nothing, np.array(z), nothing, np.zeros(3)).looks_like()
     assert words in said
     assert bool(said) == bool(words)
-
-
-def test_a_table_shows_every_candidate():
-    fits = {
-        0: made(etid.SkinRC(), 1000.0, "insensitive"),
-        1: made(etid.ParallelRC(), 1001.0),
-        2: made(etid.Resistor(), 1500.0, "misfit"),
-    }
-    text = str(choice(fits))
-    first, heads, *rows = text.splitlines()
-    assert first == "ParallelRC of 6 candidates: successful"
-    assert "2 log evidence" in heads
-    assert [row.split()[0] for row in rows[:3]] == ["ParallelRC", "SkinRC", "Resistor"]
-    assert "not fitted, the data did not ask for it: SkinCole, SkinLayers, SkinWarburg" in text
 
 
 def test_a_weight_is_of_all_candidates_or_is_none():
@@ -329,9 +274,6 @@ def test_an_inconsistent_fit_names_another_circuit_where_a_score_shows_one():
     assert made(etid.SkinRC(), 1400.0, "misfit", (19.0, *[0.0] * 8)).other_circuit == ""
 
 
-# --- The whole way --------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def study():
     return SCENE.simulate(12)
@@ -356,42 +298,6 @@ def test_the_circuit_of_a_recording_is_found(study, driver, name):
     assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
 
 
-def test_recordings_of_a_batch_are_chosen_for_alone(study, driver):
-    """As `select_circuit` chooses for each of them; the benchmark chooses so."""
-    records = [study["dry"], study["damp"]]
-    for record, found in zip(records, choices(records, driver), strict=True):
-        one = etid.select_circuit(record, driver)
-        assert type(found.fit.circuit) is type(one.fit.circuit)
-        np.testing.assert_allclose(found.fit.circuit.values(), one.fit.circuit.values(), rtol=1e-9)
-
-
-def test_other_circuits_start_at_the_resistance_and_time_constant_of_the_estimate():
-    estimate = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
-    resistance, time = 33.4e3 + 186e3, 186e3 * 0.12e-9
-    assert np.exp(circuit_starts(etid.Resistor(), estimate)[-1]) == pytest.approx(
-        resistance * 100 / 120  # typical values: 100 kΩ, and 120 kΩ of SkinRC
-    )
-    r_p, c_p = np.exp(circuit_starts(etid.ParallelRC(), estimate)[-1])
-    assert (r_p, r_p * c_p) == pytest.approx((resistance * 100 / 120, time))
-    r_s, r_p, tau, alpha = np.exp(circuit_starts(etid.SkinCole(), estimate)[-1])
-    assert (r_s + r_p, tau, alpha) == pytest.approx((resistance, time, 0.8))
-    impossible = etid.SkinRC(-33.4e3, 20e3, 0.12e-9)
-    start = circuit_starts(etid.ParallelRC(), impossible)[-1]
-    np.testing.assert_array_equal(start, etid.ParallelRC().log_values())
-
-
-@pytest.mark.slow
-def test_noise_does_not_hide_a_capacitor():
-    """Seed 4: from typical values alone, this fit ended at a capacitor of 0."""
-    load = etid.ParallelRC(186e3, 0.12e-9)
-    scene = dataclasses.replace(SCENE, trials=(Trial("parallel", load),), snr_db=20.0)
-    study = scene.simulate(4)
-    driver = etid.identify_driver([study[path] for path in study.calibrations])
-    fit = etid.identify_skin(study["parallel"], driver, circuit=etid.ParallelRC(), throw=False)
-    error = np.asarray(fit.circuit.values()) - np.asarray(load.values())
-    assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
-
-
 def test_a_spread_has_a_positive_score(study, driver):
     fit = etid.identify_skin(study["cole"], driver, throw=False)
     assert fit.support is not None
@@ -402,49 +308,6 @@ def test_a_spread_has_a_positive_score(study, driver):
     r_s, truth = float(fit.circuit.values()[0]), float(LOADS["cole"].values()[0])
     at_cole = r_s * (1 - 0.1 * float(fit.support.spread_slope[0]))
     assert abs(at_cole - truth) < 0.5 * abs(r_s - truth)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["cole", "layers"])
-def test_skin_that_is_not_one_rc_does_not_ask_for_a_calibration_first(name):
-    """At 40 dB, behind drivers drawn anew: all 10 of Cole and of two layers were `inconsistent`."""
-    dry = LOADS["dry"]
-    load = {
-        "cole": etid.SkinCole(dry.r_s, dry.r_p, dry.r_p * dry.c_p, 0.9),
-        "layers": etid.SkinLayers(33.4e3, 130e3, 0.17e-9, 56e3, 4e-9),
-    }[name]
-    for number in range(3):
-        made_with = drawn_driver(7000 + number, PARTS, TransformerDriver())
-        scene = dataclasses.replace(
-            SCENE, trials=(Trial("a", load),), driver=made_with, snr_db=40.0
-        )
-        study = scene.simulate(number)
-        driver = etid.identify_driver(study["calibration"])
-        plain = etid.identify_skin(study["a"], driver, throw=False)
-        assert plain.verdict == "misfit" or plain.other_circuit
-        chosen = etid.identify_skin(study["a"], driver, circuit="auto")
-        # A normal error exceeds 3.5 standard errors once in 2 000.
-        error = float(chosen.circuit.values()[0]) - 33.4e3
-        assert abs(error) < 3.5 * float(np.sqrt(chosen.cov[0, 0]))
-
-
-@pytest.mark.slow
-def test_skin_through_which_charge_diffuses_is_found():
-    """SkinLayers was successful, with R_s 4 to 40 standard errors wrong, in 15 of 18."""
-    load = etid.SkinWarburg(31e3, 180e3, 90e-6)
-    for number in range(3):
-        scene = dataclasses.replace(
-            SCENE,
-            trials=(Trial("a", load),),
-            driver=drawn_driver(7000 + number, PARTS, TransformerDriver()),
-        )
-        study = scene.simulate(number)
-        driver = etid.identify_driver(study["calibration"])
-        found = etid.select_circuit(study["a"], driver)
-        assert type(found.fit.circuit) is etid.SkinWarburg
-        assert found.weighed
-        error = float(found.fit.circuit.values()[0]) - 31e3
-        assert abs(error) < 3.5 * float(np.sqrt(found.fit.cov[0, 0]))
 
 
 @pytest.mark.slow
@@ -459,27 +322,6 @@ def test_a_study_gets_one_circuit(study, driver):
     # With several candidates the errors contain a spread that no test sees.
     wider = np.diagonal(fits.cov[:3] - alone.cov, axis1=1, axis2=2)
     assert (wider >= 0).all()
-
-
-@pytest.mark.slow
-def test_without_an_adequate_candidate_the_verdict_says_what_is_left(study, driver):
-    found = etid.select_circuit(
-        study["dry"], driver, candidates=[etid.Resistor(), etid.ParallelRC()], throw=False
-    )
-    assert found.fit.verdict in ("misfit", "inconsistent")
-    assert found.residual.startswith("The residual looks like")
-
-
-class Series(etid.AbstractCircuit):
-    """The circuit of `SkinRC`, drawn differently."""
-
-    r_0: Ohm = etid.parameter("ohm", typical=120e3)
-    r_1: Ohm = etid.parameter("ohm", typical=30e3)
-    c_1: Farad = etid.parameter("farad", typical=0.3e-9)
-
-    def impedance(self):
-        branch = etid.series(etid.resistor(self.r_1), etid.capacitor(self.c_1))
-        return etid.parallel(etid.resistor(self.r_0), branch)
 
 
 def test_a_file_gets_one_circuit_and_says_that_it_was_chosen(study, tmp_path):
@@ -502,14 +344,3 @@ def test_a_joint_fit_takes_the_common_circuit(study):
     found = etid.identify_jointly(few, circuit="auto")
     assert type(found.fits.circuit) is etid.SkinCole
     assert found.fits.verdicts[0] == "successful"
-
-
-@pytest.mark.slow
-def test_circuits_with_equal_impedances_are_refused(study, driver):
-    with pytest.raises(etid.RecordingError, match="SkinRC and Series, which have the same"):
-        etid.select_circuit(study["dry"], driver, candidates=[etid.SkinRC(), Series()])
-
-
-def test_a_method_without_a_likelihood_cannot_choose(study, driver):
-    with pytest.raises(ValueError, match="computes no likelihood"):
-        etid.identify_skin(study["dry"], driver, circuit="auto", method="non_parametric")

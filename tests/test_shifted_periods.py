@@ -5,8 +5,8 @@ import pytest
 
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
-from etid.recordings.causes import how_shifted, why_misaligned
-from etid.recordings.preflight import Inspected, preflight
+from etid.recordings.causes import how_shifted
+from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from tests.test_changes import falling, recorded
 from tests.test_disturbances import off
@@ -66,26 +66,6 @@ def test_a_period_whose_pulse_has_the_fault_is_left_out(records, load, fault):
         assert f"pulse of period {period + 1}" in how_shifted(seen)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_an_aligned_record_is_the_undisturbed_one_after_the_period_with_the_fault(records, fault):
-    whole = records["damp"]
-    seen = Inspected(faulty(whole, fault, 9000))  # in the third period
-    assert seen.shifts is not None
-    np.testing.assert_array_equal(seen.v_th, whole.v_th)
-    expected = np.roll(whole.v_out, -seen.shifts.late[0])
-    inside = np.r_[1:8999, 10_001:19_998]
-    np.testing.assert_array_equal(seen.v_out[inside], expected[inside])
-
-
-def test_faults_in_the_pulses_of_two_of_three_periods_are_refused():
-    three = rung("dry").simulate(1)[TRIAL]
-    one = faulty(three, "lost", 90)
-    assert preflight(Inspected(one)) is None
-    seen = Inspected(faulty(one, "doubled", round(PERIOD) + 90))
-    assert preflight(seen) == "misaligned"
-    assert "lost or doubled samples within pulses" in why_misaligned(seen)
-
-
 @pytest.mark.parametrize("load", LOADS)
 def test_noise_jitter_and_other_skin_do_not_shift_periods(load):
     for snr_db in (20.0, 30.0, 60.0):
@@ -96,12 +76,6 @@ def test_noise_jitter_and_other_skin_do_not_shift_periods(load):
         for fall in (0.3, 0.6):
             one = recorded(rung(load), falling(LOADS[load], name, fall))
             assert Inspected(one).shifts is None
-
-
-def test_a_pulse_that_comes_late_in_both_records_does_no_harm(records):
-    one = records["damp"]
-    both = faulty(faulty(one, "lost", 9000), "lost", 9000, "v_th")
-    assert Inspected(both).shifts is None
 
 
 @pytest.mark.parametrize("begins", [0, 200])

@@ -119,41 +119,17 @@ def test_a_fault_of_one_record_is_refused_and_the_skin_itself_is_not():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("rate", "periods"), [(100e3, 1.5), (200e3, 1.1), (500e3, 0.6), (1e6, 0.4)]
-)
-def test_faultless_pulses_are_hardly_ever_refused(rate, periods):
-    """If one of a thousand is refused, more than 2 of 160 are once in 1400 studies."""
-    draws = [
-        draw
-        for skin in SKINS.values()
-        for shape in EDGES
-        for snr_db in (40.0, 80.0)
-        for draw in recordings(
-            skin, 20, snr_db=snr_db, rate=rate, periods=periods, shape=shape, seed=3
-        )
-    ]
-    verdicts = etid.identify_skins(draws).verdicts
-    refused = np.flatnonzero(~np.isin(verdicts, ["successful", "insensitive"]))
-    assert refused.size <= 2, [(index, verdicts[index]) for index in refused]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("fault", "skin", "snr_db", "least"),
+    ("fault", "skin", "snr_db", "least", "most"),
     [
-        (slow_current, "dry", 40.0, 0.6),
-        (slow_current, "damp", 40.0, 0.7),
-        (slow_voltage, "dry", 50.0, 0.4),
-        (beside, "dry", 50.0, 0.95),
-        (beside, "damp", 60.0, 0.95),
-        (compressed_current, "dry", 50.0, 0.9),
-        (compressed_current, "damp", 50.0, 0.95),
-        (compressed_voltage, "dry", 40.0, 0.95),
-        (compressed_voltage, "damp", 40.0, 0.95),
-        (falling, "dry", 40.0, 0.95),
-        (falling, "damp", 40.0, 0.95),
+        (right, "dry", 40.0, 0.0, 0.05),
+        (slow_current, "damp", 40.0, 0.7, 1.0),
+        (slow_voltage, "dry", 50.0, 0.4, 1.0),
+        (beside, "dry", 50.0, 0.95, 1.0),
+        (compressed_current, "dry", 50.0, 0.9, 1.0),
+        (compressed_voltage, "damp", 40.0, 0.95, 1.0),
+        (falling, "damp", 40.0, 0.95, 1.0),
     ],
 )
-def test_faults_are_refused_as_often_as_the_page_says(fault, skin, snr_db, least):
+def test_faults_are_refused_as_often_as_the_page_says(fault, skin, snr_db, least, most):
     fits = etid.identify_skins(recordings(SKINS[skin], 40, fault=fault, snr_db=snr_db, seed=5))
-    assert np.mean(fits.verdicts == "misfit") >= least
+    assert least <= np.mean(fits.verdicts == "misfit") <= most

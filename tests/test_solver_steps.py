@@ -11,11 +11,7 @@ import pytest
 
 from etid.solvers.levenberg_marquardt import (
     LevenbergMarquardt,
-    best_start,
-    normal_equations,
-    second_order,
 )
-from tests import kept_numbers
 
 TARGET = jnp.array([5.0, -2.0])
 DAMPING = 1e-2
@@ -88,58 +84,3 @@ def test_a_step_of_rounding_size_far_from_the_minimum_is_a_failure():
     converged = dataclasses.replace(NEVER, rtol=1e-6)
     near = jax.tree.map(lambda a: a + 1e-9, TARGET)
     assert after(converged, near, [near])[1][1].result == optx.RESULTS.successful
-
-
-def valley(y, args):
-    """Rosenbrock's, with a residual that is left."""
-    return jnp.stack([10 * (y[1] - y[0] ** 2), 1 - y[0], 0.1 + 0 * y[0]]), args
-
-
-def wall(y, args):
-    """It has no value where y₀ is negative, so that steps are rejected."""
-    return jnp.stack([jnp.log(y[0]) - 2.0, y[1] * y[0] - 3.0, 0.2 * y[1] ** 2]), args
-
-
-@pytest.mark.parametrize("geodesic", [False, True])
-@pytest.mark.parametrize("of", [valley, wall])
-def test_each_step_is_that_of_before(of, geodesic):
-    solver = LevenbergMarquardt(rtol=1e-5, geodesic=geodesic)
-    y = jnp.array([-1.2, 1.0]) if of is valley else jnp.array([40.0, 3.0])
-    state = solver.init(of, y, None, {}, None, None, frozenset())
-
-    @jax.jit
-    def step(y, state):
-        y, state, _ = solver.step(of, y, None, {}, state, frozenset())
-        return y, state
-
-    rows = []
-    for _ in range(30):
-        y, state = step(y, state)
-        count, idle, end = state.accepted_steps, state.idle, state.terminate
-        rows.append([*y.tolist(), float(state.accepted.objective), *map(float, (count, idle, end))])
-        if bool(state.terminate):
-            break
-    assert bool(state.terminate)
-    # Rounding grows from step to step; the curvature is known to six digits.
-    numbers = {"steps": kept_numbers.Number(np.array(rows), 1e-4, 1e-7)}
-    numbers["successful"] = kept_numbers.Number(bool(state.result == optx.RESULTS.successful))
-    kept_numbers.check(f"steps_{of.__name__}_{'bent' if geodesic else 'plain'}", numbers)
-
-
-def test_equations_and_curvature_are_those_written_down():
-    """r = (10 (y₁ − y₀²), 1 − y₀, 0.1): its Jacobian, and r″ = (−20 v₀², 0, 0) along v."""
-    y, v = jnp.array([0.7, 0.2]), jnp.array([0.3, -0.5])
-    r = np.array([10 * (0.2 - 0.49), 0.3, 0.1])
-    jacobian = np.array([[-14.0, 10.0], [-1.0, 0.0], [0.0, 0.0]])
-
-    def residual(y, args):
-        return valley(y, args)[0]
-
-    found = normal_equations(residual, y)
-    np.testing.assert_allclose(found.objective, r @ r / 2)
-    np.testing.assert_allclose(found.gradient, jacobian.T @ r)
-    np.testing.assert_allclose(found.matrix, jacobian.T @ jacobian)
-    bent = second_order(residual, y, v)
-    np.testing.assert_allclose(bent, jacobian.T @ [-20 * 0.09, 0.0, 0.0], rtol=1e-6)
-    starts = jnp.array([[3.0, 1.0], [0.9, 0.8], [jnp.nan, 0.0], [0.0, 0.0]])
-    np.testing.assert_array_equal(best_start(lambda y: residual(y, None), starts), starts[1])

@@ -1,20 +1,15 @@
 """Harmonics: exact for periodic records, whatever the number of samples in a period."""
 
-import os
-import subprocess
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from etid.signals import harmonics as spectra
-from etid.signals.harmonics import Spectrum, harmonics, signal_share, whole_periods
+from etid.signals.harmonics import harmonics, signal_share, whole_periods
 from etid.signals.pulse_train import find_pulses
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
-from tests import kept_numbers
 
 spectrum = jax.jit(spectra.spectrum, static_argnums=(5, 6))
 RATE, PULSE = 200e3, 60.0
@@ -22,17 +17,19 @@ SLOW = 50e3
 
 
 @pytest.mark.parametrize(
-    ("samples", "expected"),
+    ("samples", "rate", "pulse_rate", "expected"),
     [
-        (10_000, (3, 10_000)),
-        (3333, (1, 3333)),  # 0.9999 of a period: a third of a sample is missing
-        (12_333, (3, 10_000)),  # 3.7 periods
-        (3332, (0, 0)),
-        (600, (0, 0)),  # one pulse
+        (10_000, RATE, PULSE, (3, 10_000)),
+        (3333, RATE, PULSE, (1, 3333)),  # 0.9999 of a period: a third of a sample is missing
+        (12_333, RATE, PULSE, (3, 10_000)),  # 3.7 periods
+        (3332, RATE, PULSE, (0, 0)),
+        (4, 5.0, 2.0, (1, 2)),  # 2.5 samples to a period: half a sample may be missing
+        (5, 5.0, 2.0, (2, 5)),
+        (6, 5.0, 2.0, (2, 5)),
     ],
 )
-def test_whole_periods(samples, expected):
-    assert whole_periods(samples, RATE, PULSE) == expected
+def test_whole_periods(samples, rate, pulse_rate, expected):
+    assert whole_periods(samples, rate, pulse_rate) == expected
 
 
 def test_harmonics_are_those_of_the_signal_and_a_drift_is_not_in_them():
@@ -106,61 +103,6 @@ def test_numpy_and_jax_see_the_same_harmonics(periods, samples):
     assert not host[-1][(samples + 1) // (2 * periods) :].any()
 
 
-def test_one_period_cannot_tell_aliases_and_leaves_the_upper_band_out():
-    v = jnp.asarray(np.where(np.arange(3333) < 133, 50.0, 0.0))
-    small = jnp.asarray(1e-6)
-    found = Spectrum(*spectrum(v, v, small, small, jnp.asarray(RATE), 1, 3333))
-    last = float(found.frequency[found.selected].max())
-    assert abs(last - spectra.ALIASED * RATE) < PULSE * 1.001
-
-
-def test_the_share_of_signal_of_one_lane_does_not_depend_on_the_others():
-    generator = np.random.default_rng(5)
-    coefficients = jnp.asarray(generator.normal(size=(7, 1666)) + 1j)
-    variance = jnp.ones((7, 1666))
-    together = jax.jit(jax.vmap(signal_share))(coefficients.at[3].set(jnp.nan), variance)
-    for lane in (0, 2, 4, 6):
-        alone = signal_share(coefficients[lane], variance[lane])
-        power, noise = np.abs(coefficients[lane]) ** 2, np.ones(1666)
-        box = np.ones(25)
-        share = 1 - np.convolve(noise, box, "same") / np.convolve(power, box, "same")
-        np.testing.assert_allclose(alone, np.clip(share, 0, 1), rtol=1e-12)
-        # A batch may add the same numbers in another order.
-        np.testing.assert_allclose(together[lane], alone, rtol=1e-14)
-
-
-BUSY = """
-import os, time
-os.sched_setaffinity(0, range(os.cpu_count()))  # a test may have been given one core
-import numpy as np
-from etid.signals.harmonics import harmonics
-from etid.signals.noise import noise_std
-from etid.signals.quick_looks import flickering
-v = np.random.default_rng(0).normal(size=10_000)
-long = np.random.default_rng(0).normal(size=(16, 2, 33_330))
-def call():
-    harmonics(v, 3, v.size)
-    noise_std(v)
-    noise_std(long)
-    flickering(long, np.ones((16, 2)), 9, 30_000)
-call()
-time.sleep(1)  # threads of BLAS wait actively after the pseudoinverse of the first call
-everyone, own = time.process_time(), time.thread_time()
-for _ in range(40):
-    call()
-own = time.thread_time() - own
-print((time.process_time() - everyone - own) / own)
-"""
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs the cores of Linux")
-@pytest.mark.skipif(os.cpu_count() == 1, reason="one core has one thread")
-def test_what_each_record_needs_starts_no_threads():
-    run = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=True)
-    # Time of other threads over that of this one. Those of BLAS wait actively: one took 0.5 to 3.
-    assert float(run.stdout) < 0.05
-
-
 @pytest.mark.parametrize(
     ("samples", "highest"),
     [
@@ -182,13 +124,6 @@ def test_harmonics_that_aliases_reach_are_left_out(samples, highest):
     assert used.size == round(used.max() / PULSE)  # and none below is
 
 
-def test_real_parts_come_before_imaginary_parts():
-    values = np.array([[1 + 2j, 3 + 4j], [5 + 6j, 7 + 8j]])
-    expected = [[1, 3, 2, 4], [5, 7, 6, 8]]
-    np.testing.assert_array_equal(spectra.real_parts(values), expected)
-    np.testing.assert_array_equal(spectra.real_parts(jnp.asarray(values)), expected)
-
-
 def test_a_cubic_drift_is_not_in_the_harmonics():
     """Of six periods; a polynomial of the fourth degree is no drift, and stays."""
     periods, samples = 6, 20_000
@@ -196,35 +131,3 @@ def test_a_cubic_drift_is_not_in_the_harmonics():
     found = harmonics(np.stack([ramp**3, ramp**4 - ramp**2]), periods, samples)
     assert np.abs(found[0]).max() < 1e-12
     assert np.abs(found[1]).max() > 1e-5
-
-
-def test_aliases_are_told_from_harmonics_where_a_period_is_no_whole_number_of_samples():
-    assert spectra.separates_aliases(3, 10_000)
-    assert not spectra.separates_aliases(1, 3333)
-    assert not spectra.separates_aliases(3, 9_999)
-
-
-@pytest.mark.parametrize(("periods", "samples"), [(1, 3333), (3, 10_000), (2, 6667), (4, 8000)])
-def test_spectra_are_those_of_before(periods, samples):
-    """Fields, their noise, what is padded, and the local share of the signal."""
-    rng = np.random.default_rng(8)
-    v, w = np.cumsum(rng.normal(size=(2, samples)), axis=1)
-    quiet, loud, rate = (np.asarray(s) for s in (0.1, 2.0, RATE))
-    fields = spectra.spectrum(v, w, quiet, loud, rate, periods, samples)
-    names = ("frequency", "x", "y", "variance_x", "variance_y", "selected")
-    numbers = {}
-    for name, value in zip(names, fields, strict=True):
-        some = np.concatenate([np.asarray(value)[:4], np.asarray(value)[::97], value[-4:]])
-        numbers[name] = kept_numbers.Number(some, 1e-9, 1e-12)
-        numbers[f"{name}_size"] = kept_numbers.Number(np.size(value))
-    numbers["used"] = kept_numbers.Number(int(np.sum(fields[-1])))
-    share = signal_share(jnp.asarray(fields[2]), jnp.asarray(fields[4]))
-    numbers["share"] = kept_numbers.Number(np.asarray(share)[::29], 1e-9, 1e-12)
-    numbers["apart"] = kept_numbers.Number(spectra.separates_aliases(periods, samples))
-    kept_numbers.check(f"spectrum_{periods}_{samples}", numbers)
-
-
-@pytest.mark.parametrize("past", [-1, 0, 1])
-def test_half_a_sample_may_be_missing_from_the_last_period(past):
-    """2.5 samples to a period: 5 samples are two periods, as are 4.6, and 4.4 are one."""
-    assert whole_periods(5 + past, 5.0, 2.0) == {-1: (1, 2), 0: (2, 5), 1: (2, 5)}[past]

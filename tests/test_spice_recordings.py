@@ -84,52 +84,22 @@ def test_without_noise_the_elements_are_those_of_the_netlist(spice, reference_da
     assert (np.abs(errors(result, true)[0]) < limit).all()
 
 
-@pytest.mark.slow
-def test_whole_periods_are_identified_by_maximum_likelihood_and_one_pulse_by_output_error(spice):
-    assert spice("clean_dry")[0].fits.fit.method == "maximum_likelihood"
-    result, true = spice("one_pulse_dry")  # 600 samples of a period of 3333
-    assert result.fits.fit.method == "output_error"
-    assert set(result.fits.verdicts) == {"successful"}
-    error, stderr, _ = errors(result, true)
-    assert (np.abs(error) < SIGMAS * stderr).all()
-
-
 @pytest.mark.parametrize("name", ["lab_built", "paper_noise_built", "jitter_dry", "jitter_damp"])
-def test_noise_and_trigger_delays_leave_every_trial_within_its_error(spice, name):
+def test_trials_and_their_mean_are_within_their_errors(spice, name):
     """23 trials at 60 and at 30 dB; 12 whose two records were triggered 50 ns rms apart."""
     result, true = spice(name)
     assert set(result.fits.verdicts) == {"successful"}, (result.failures, result.fits.counts())
-    error, stderr, _ = errors(result, true)
+    error, stderr, shared = errors(result, true)
     assert (np.abs(error) < SIGMAS * stderr).all()
-
-
-@pytest.mark.parametrize("name", ["lab_built", "paper_noise_built", "jitter_dry", "jitter_damp"])
-def test_the_mean_of_the_trials_is_within_the_error_they_share(spice, name):
-    """The driver's error does not average out, and no spread between trials shows it."""
-    error, stderr, shared = errors(*spice(name))
+    # The driver's error does not average out, and no spread between trials shows it.
     own = stderr**2 - shared**2
     assert (own > 0).all()
     of_mean = np.sqrt(own.mean(0) / len(own) + (shared**2).mean(0))
     assert (np.abs(error.mean(0)) < MEAN_SIGMAS * of_mean).all()
-
-
-def test_trials_scatter_by_their_own_error_and_not_by_the_shared_one(spice):
-    """χ² of 23 trials around their mean, each scaled by the part of its error that is its own."""
-    error, stderr, shared = errors(*spice("lab_built"))
-    own = np.sqrt((stderr**2 - shared**2).mean(0))
-    ratio = error.std(0, ddof=1) / own
-    # The ratio of 22 degrees of freedom scatters by 1/sqrt(44); 4 of these on either side.
-    assert (np.abs(ratio - 1) < 4 / np.sqrt(2 * (len(error) - 1))).all()
-
-
-def test_the_standard_error_is_not_below_the_cramer_rao_bound(spice, reference_data):
-    """The bound of truth.json is for a known driver; no honest error can be much smaller."""
-    scenes = json.loads((reference_data("spice_recordings") / "truth.json").read_text())["scenes"]
-    for name in ("lab_built", "paper_noise_built"):
-        _, stderr, _ = errors(*spice(name))
-        bound = [trial["crb_rel_RsRpCp"] for trial in scenes[name]["trials"]]
-        # Noise is estimated from the record to about 5 %, and the error with it.
-        assert (stderr > 0.9 * np.array(bound)).all()
+    if name == "lab_built":
+        # The ratio of 22 degrees of freedom scatters by 1/sqrt(44); 4 of these on either side.
+        scatter = error.std(0, ddof=1) / np.sqrt(own.mean(0))
+        assert (np.abs(scatter - 1) < 4 / np.sqrt(2 * (len(error) - 1))).all()
 
 
 def test_a_clipped_calibration_is_refused_and_costs_its_trials(spice):
@@ -139,36 +109,3 @@ def test_a_clipped_calibration_is_refused_and_costs_its_trials(spice):
     assert result.fits.counts() == {"driver_failed": 2}
     assert all("saturated" in note for note in result.fits.notes)
     assert np.isnan(np.asarray(result.fits.circuit.values())).all()
-
-
-@pytest.mark.slow
-def test_the_papers_method_says_that_its_noisy_fits_are_none(spice):
-    """At 30 dB its R_s is 83 % off: whatever the verdicts are, none may be successful."""
-    result, _ = spice("paper_noise_built", method="steiglitz_mcbride")
-    assert "successful" not in result.fits.counts()
-    assert sum(result.fits.counts().values()) == 23
-
-
-# Scenes of the length of `clean_dry`, and of three others, which compile for long.
-PERIODIC = (
-    "clean_dry clean_damp clean_resistors lab_built lab_dry lab_damp paper_noise_built noisy_dry "
-    "jitter_dry jitter_damp subjects_dry subjects_damp offset_drift_built noisy_dry_averaged "
-    "fast_damp"
-).split()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PERIODIC)
-def test_the_circuit_of_every_recording_is_chosen(reference_data, tmp_path, name):
-    """148 recordings: skin of one relaxation from 24 dB on, and five resistors."""
-    folder, file = reference_data("spice_recordings"), tmp_path / "study.h5"
-    truth = json.loads((folder / "truth.json").read_text())["scenes"][name]["trials"]
-    true = etid.Resistor if "R" in truth[0]["elements"] else etid.SkinRC
-    etid.import_file(folder / f"{name}.npz", file)
-    with etid.read(file) as study:
-        driver = etid.identify_driver(list(study.calibrations.recordings()))
-        fits = [
-            etid.identify_skin(record, driver, circuit="auto")
-            for record in study.loaded.recordings()
-        ]
-    assert [type(fit.circuit) for fit in fits] == [true] * len(truth)

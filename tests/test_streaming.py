@@ -4,7 +4,6 @@ import concurrent.futures
 import contextlib
 import os
 import pathlib
-import queue
 import signal
 import subprocess
 import sys
@@ -16,7 +15,7 @@ import pytest
 
 import etid
 from etid.identify import file as streaming
-from etid.identify.file import ResumeError, fit_file, processes
+from etid.identify.file import ResumeError, fit_file
 from etid.results.study_fits import StudyFits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -81,20 +80,6 @@ def test_every_part_has_its_drivers_though_its_process_knew_them_before(source, 
             fit_file(source, tmp_path / name, method=METHOD, executor=executor)
         same(tmp_path / name, whole)
         assert set(StudyFits.read(tmp_path / name).drivers) == {("calibration/0",)}
-
-
-def test_the_file_is_read_once_and_closed(source, tmp_path, monkeypatch):
-    studies, real = [], streaming.read
-
-    def counted(path):
-        studies.append(real(path))
-        return studies[-1]
-
-    monkeypatch.setattr(streaming, "read", counted)
-    fit_file(source, tmp_path / "fits.h5", method=METHOD)
-    (study,) = studies
-    with pytest.raises(etid.RecordingError, match="closed"):
-        study["loaded/0"]
 
 
 def test_an_interrupted_run_goes_on_where_it_was(source, whole, tmp_path, monkeypatch):
@@ -170,14 +155,6 @@ def test_kill_minus_nine_three_times(source, whole, tmp_path):
     same(target, whole)
 
 
-@pytest.mark.slow
-def test_processes_give_the_same(source, whole, tmp_path):
-    target = tmp_path / "fits.h5"
-    with processes(2) as executor:
-        fit_file(source, target, method=METHOD, executor=executor)
-    same(target, whole)
-
-
 def test_a_lost_worker_keeps_what_is_done(source, tmp_path):
     class Broken(concurrent.futures.Executor):
         def submit(self, fn, /, *args, **kwargs):
@@ -227,13 +204,3 @@ def _arm(marker: pathlib.Path) -> None:
         return real(*arguments)
 
     streaming.identify_part = deadly
-
-
-def test_a_worker_binds_itself_to_its_core_and_leaves_ctrl_c_to_its_parent(monkeypatch):
-    cores, bound, handlers = queue.SimpleQueue(), [], []
-    cores.put(3)
-    monkeypatch.setattr(os, "sched_setaffinity", lambda *asked: bound.append(asked), raising=False)
-    monkeypatch.setattr(signal, "signal", lambda *asked: handlers.append(asked))
-    streaming._pin(cores)
-    assert bound == [(0, {3})]  # 0 is the process itself
-    assert handlers == [(signal.SIGINT, signal.SIG_DFL)]

@@ -131,8 +131,3 @@ def test_columns_of_different_lengths_are_refused(path):
         with pytest.raises(RecordingError, match="has 2 rows, a has 3") as raised:
             same_length(table, {"a": np.zeros(3), "b": np.zeros(3), "c": np.zeros(2)})
         assert raised.value.field == "c"
-
-
-def test_an_ending_of_another_format_is_refused(tmp_path):
-    with pytest.raises(RecordingError):
-        write_table(tmp_path / "table.csv", COLUMNS, units={}, attributes={})

@@ -6,6 +6,7 @@ import pytest
 import etid
 from etid.recordings.errors import RecordingError
 from etid.results.variation import REST, _levels, _Model
+from tests import pictures
 
 SUBJECTS, SESSIONS, TRIALS = 10, 3, 5
 SUBJECT = np.repeat(np.arange(SUBJECTS), SESSIONS * TRIALS)
@@ -47,36 +48,20 @@ def test_the_restricted_likelihood_is_that_of_all_contrasts():
         assert ours == pytest.approx(deviance(other) - deviance(first), rel=1e-6)
 
 
-@pytest.mark.slow
-def test_intervals_contain_the_truth_in_95_per_cent_of_studies():
-    truth, studies = np.array([0.3, 0.1, 0.05]), 60
-    inside = np.zeros(3)
-    for seed in range(studies):
-        s = np.full(SUBJECT.size, 0.02)
-        model = model_of(drawn(seed, truth, s), s)
-        best, _, _ = model.fitted()
-        for row in range(3):
-            low, high = model.interval(row, best)
-            inside[row] += low <= truth[row] <= high
-    # Of 60 studies, fewer than 52 are inside once in 500 times at 95 %.
-    assert (inside >= 52).all(), inside
-
-
 @pytest.fixture(scope="module")
 def fits():
-    """Fits of one recording, moved by a known factor for each subject and session."""
-    study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=1)
-    driver = etid.identify_driver(study["calibration/98k8"], order=5)
-    few = etid.identify_skins([study[path] for path in list(study.loaded)[:4]], driver)
-    rows = np.arange(24) % 4
-    found = few.take(rows)
+    """Fits of one skin with their errors, moved by a known factor for each subject."""
+    found = pictures.fits().take(np.zeros(24, int))
     subject, session = np.arange(24) // 8, np.arange(24) // 4 % 2
     factor = np.exp(np.array([-0.5, 0.0, 0.5])[subject])
-    circuit = dataclasses.replace(found.circuit, r_p=factor * np.asarray(found.circuit.r_p))
-    labels = {**found.labels, "subject": subject.astype(str), "session": session.astype(str)}
-    return dataclasses.replace(
-        found, fit=dataclasses.replace(found.fit, circuit=circuit), labels=labels
+    noise = np.exp(pictures.RELATIVE[1] * np.random.default_rng(0).standard_normal(24))
+    r_p = factor * noise * np.asarray(found.circuit.r_p)
+    cov = found.cov * (factor[:, None, None] ** 2)
+    fit = dataclasses.replace(
+        found.fit, circuit=dataclasses.replace(found.circuit, r_p=r_p), cov=cov
     )
+    labels = {**found.labels, "subject": subject.astype(str), "session": session.astype(str)}
+    return dataclasses.replace(found, fit=fit, labels=labels)
 
 
 def test_a_variation_that_is_there_is_found_and_one_that_is_not_is_zero(fits):
@@ -86,7 +71,7 @@ def test_a_variation_that_is_there_is_found_and_one_that_is_not_is_zero(fits):
     assert subjects.low < 0.5 < subjects.high
     assert subjects.std == pytest.approx(0.5, rel=0.05)
     assert sessions.low == 0.0
-    assert max(sessions.high, recordings.high) < 0.002  # the error of a fit is 0.0005
+    assert max(sessions.high, recordings.high) < 0.02  # the error of a fit is 0.005
     assert "between subjects" in str(found)
 
 

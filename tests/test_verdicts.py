@@ -1,16 +1,13 @@
 """Every verdict is produced here, and none is silent."""
 
-from collections import Counter
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
 
 import etid
-from etid.circuits.elements import Ohm
-from etid.results.verdicts import RESULTS, message, own_part, verdict, verdict_names, verdicts_of
+from etid.results.verdicts import RESULTS, message
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -47,11 +44,6 @@ def verdict_of(recording, driver, **options):
     return fit.verdict
 
 
-def test_successful(study, driver):
-    assert verdict_of(study["loaded/0"], driver) == "successful"
-    assert message("successful") == ""
-
-
 def part(recording, size):
     return {"v_th": recording.v_th[:size], "v_out": recording.v_out[:size]}
 
@@ -59,6 +51,7 @@ def part(recording, size):
 @pytest.mark.parametrize(
     ("change", "verdict"),
     [
+        (lambda one: {}, "successful"),
         (lambda one: {"v_out": np.zeros(LENGTH)}, "flat"),
         (lambda one: {"v_out": np.minimum(one.v_out, 40.0), "adc_range": None}, "saturated"),
         (lambda one: {"v_th": np.append(one.v_th[1:], np.inf)}, "nonfinite_samples"),
@@ -70,10 +63,6 @@ def test_samples_that_are_broken(study, driver, change, verdict):
     """What else breaks them is in `test_preflight`."""
     recording = study["loaded/0"]
     assert verdict_of(recording.replace(**change(recording)), driver) == verdict
-
-
-def test_saturated_at_the_end_of_the_range_of_the_converter(driver):
-    assert verdict_of(simulate(full_scale=2.6)["loaded/0"], driver) == "saturated"
 
 
 def test_insensitive(driver):
@@ -118,56 +107,19 @@ def test_unreadable_without_a_calibration(study):
     assert "etid import --calibration FILE OHM" in alone.fits.notes[0]
 
 
-@pytest.fixture(scope="module")
-def baselines():
-    """The paper's method from quiet to noisy: how often its drivers and skins end how."""
-    found = Counter()
-    for snr_db in (None, 60.0, 40.0, 30.0):
-        for seed in range(1):
-            study = simulate(snr_db=snr_db, seed=seed)
-            driver = etid.identify_driver(
-                study["calibration/98k8"], method="steiglitz_mcbride", throw=False
-            )
-            found[driver.verdict] += 1
-            for method in ("steiglitz_mcbride", "equation_error"):
-                found[verdict_of(study["loaded/0"], driver, method=method)] += 1
-    return found
-
-
-@pytest.mark.parametrize("name", ["max_steps_reached", "unstable", "biased", "misfit"])
-def test_the_papers_method_says_how_it_fails(baselines, name):
-    assert baselines[name] > 0
-
-
-def test_the_papers_method_is_never_successful_here(baselines):
+def test_the_papers_method_says_how_it_fails():
     """Without noise its loop is unstable, with noise its R_s is far off."""
-    assert baselines["successful"] == 0
-    assert baselines.total() == 12
-
-
-class Wall(etid.AbstractCircuit):
-    """No model of anything: below `LEVEL` it jumps, so that every step down is a wrong one."""
-
-    r: Ohm = etid.parameter("ohm", typical=100e3)
-
-    def impedance(self):
-        return etid.resistor(jnp.where(self.r >= LEVEL, self.r, 1e9))
-
-
-LEVEL = 100e3 * (1 - 1e-14)  # where its fit starts, less what logarithm and exponential round
-
-
-@pytest.mark.slow
-def test_a_solver_that_cannot_move_reports_no_success(driver):
-    """The slope says down, and no step is small enough: that is no convergence."""
-    recording = simulate(ResistorLoad(50e3))["loaded/0"]
-    assert verdict_of(recording, driver, circuit=Wall()) == "max_steps_reached"
-
-
-def test_names_and_values_are_inverse():
-    names = np.array([["flat", "successful"], ["misfit", "biased"]])
-    np.testing.assert_array_equal(verdict_names(verdicts_of(names)), names)
-    assert verdict_names(verdict("unstable")).item() == "unstable"
+    found = set()
+    for snr_db in (None, 60.0, 40.0, 30.0):
+        of = simulate(snr_db=snr_db)
+        driver = etid.identify_driver(
+            of["calibration/98k8"], method="steiglitz_mcbride", throw=False
+        )
+        found.add(driver.verdict)
+        for method in ("steiglitz_mcbride", "equation_error"):
+            found.add(verdict_of(of["loaded/0"], driver, method=method))
+    assert found >= {"max_steps_reached", "unstable", "biased", "misfit"}
+    assert "successful" not in found
 
 
 @pytest.mark.parametrize("name", sorted(RESULTS._name_to_item))
@@ -178,12 +130,3 @@ def test_every_failure_says_what_it_is(name):
 def test_a_verdict_is_said_in_forty_words():
     own = set(vars(RESULTS)["_name_to_item"]) - set(vars(optx.RESULTS)["_name_to_item"])
     assert {name for name in own if len(message(name).split()) > 40} == set()
-
-
-def test_a_note_beyond_the_message_of_its_verdict():
-    changed = message("changed")
-    assert own_part("changed", f"{changed} During the record: r_p -20 ± 1 %") == (
-        "During the record: r_p -20 ± 1 %"
-    )
-    assert own_part("unconnected", message("unconnected")) == ""
-    assert own_part("successful", "aligned by 3 samples") == "aligned by 3 samples"

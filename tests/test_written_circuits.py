@@ -70,11 +70,6 @@ def test_what_is_no_circuit_is_refused(string):
         etid.circuit(string)
 
 
-def test_an_element_occurs_once():
-    with pytest.raises(ValueError, match="has R1 twice"):
-        etid.circuit("R1-p(R1,C1)")
-
-
 def test_a_written_circuit_is_found_by_its_name_and_copied():
     one = etid.circuit("R0-p(R1,C1)")
     assert class_path(type(one)) == "etid:R0-p(R1,C1)"
