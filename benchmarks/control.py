@@ -1,11 +1,11 @@
 """Closed loop: the charge at 98 electrodes under a fingertip that changes, and the cap on it.
 
 `benchmarks.control_hazards` counts the pulses above the cap, with loads from a short circuit to
-none and with wrong records. The rest is the charge against ngspice.
+none and with wrong records. The rest is the charge against ngspice (`benchmarks.control_plant`).
 
-The plant is `benchmarks.control_plant`. Some electrodes stay dry, some become wet within 100 ms at
-different times, some sweat slowly, and one is lifted off and put back. The driver is identified
-from records of ngspice with the same noise and delays. Every controller has the same task.
+Some electrodes stay dry, some become wet within 100 ms at different times, some sweat slowly, and
+one is lifted off and put back. The driver is identified from records of ngspice with the same noise
+and delays. Every controller has the same task.
 
 * etid: `etid.Tracker` and `etid.Controller`.
 * constant voltage: the terminal voltage is regulated to that of a typical dry fingertip.
@@ -13,18 +13,13 @@ from records of ngspice with the same noise and delays. Every controller has the
 * integral: A += k (Q* − Q) / q₀ with the true charge Q of the last pulse, as from a perfect sensor,
   and q₀ of typical dry skin; k = 0.25 is stable up to eight times this q₀.
 * model reference: direct model-reference adaptive control with a feed-forward gain and the MIT
-  rule (Åström and Wittenmark 1995, chapter 5), normalised, once per pulse, with the true charge. Of
-  Shen, Gregory and Xi (2014) only the abstract was available: a direct model-reference adaptive
-  controller whose current follows a pulsed reference. Their controller acts within the pulse.
+  rule (Åström and Wittenmark 1995, chapter 5), normalised, once per pulse, with the true charge.
 
-The targets are those of `TARGETS`. They count every pulse but those of a change and the two that
-follow it.
-
-**What noise explains.** An amplitude is given before its pulse. Skin that sweats changes its charge
-by g until then; noise and calibration leave a standard error σ of the charge of the last pulse. So
-many pulses as normal errors with mean g and this σ would miss the charge are printed beside the
-number of those that did. They excuse none. σ comes from the information of the tracker;
-`tests/test_online.py` compares it with the scatter of errors.
+The targets count every pulse but those of a change and the two that follow it. An amplitude is
+given before its pulse. Skin that sweats changes its charge by g until then; noise and calibration
+leave a standard error σ of the charge of the last pulse, which comes from the information of the
+tracker. So many pulses as normal errors with mean g and this σ would miss the charge are printed
+beside the number of those that did. They excuse none.
 """
 
 import argparse
@@ -75,8 +70,6 @@ STYLES = {
 NOISIER = "#f39c12"  # of etid with more noise
 
 Command = Callable[[int, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-
-
 OPTIONS = (
     option("--electrodes", default=98),
     option("--pulses", default=120),
@@ -240,8 +233,7 @@ def missing(
     mean: Float[np.ndarray, " lane"], sigma: Float[Array, " lane"]
 ) -> Float[np.ndarray, " lane"]:
     """Probability that a normal error misses the target; 0 where there is no estimate."""
-    width = np.asarray(sigma)
-    tails = (-NEAR - mean) / width, (mean - NEAR) / width
+    tails = (-NEAR - mean) / np.asarray(sigma), (mean - NEAR) / np.asarray(sigma)
     return np.nan_to_num(sum(scipy.special.ndtr(tail) for tail in tails))
 
 

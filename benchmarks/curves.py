@@ -39,10 +39,6 @@ AXES = {
 Row = dict[str, Any]
 
 
-def _row(against: str, what: str, number: int, seconds: float) -> Row:
-    return {"against": against, "what": what, "number": number, "seconds": seconds}
-
-
 def seconds(call: Callable[[], Any]) -> float:
     """Median time of a call after a first one, of as many as need not take long."""
     once = median_time(call, 1)
@@ -83,7 +79,7 @@ def against_samples(sizes: Sequence[int]) -> Iterator[Row]:
     base = problem(10_000, 1)
     for size in sizes:
         for name, call in calls(stretched(base, size)).items():
-            yield _row("samples", name, size, seconds(call))
+            yield {"against": "samples", "what": name, "number": size, "seconds": seconds(call)}
 
 
 def against_lanes(counts: Sequence[int]) -> Iterator[Row]:
@@ -111,7 +107,7 @@ def against_lanes(counts: Sequence[int]) -> Iterator[Row]:
                 break
             index = np.arange(count) % len(of.records)
             each = seconds(lambda run=run, index=index: run(index)) / done
-            yield _row("lanes", name, count, each)
+            yield {"against": "lanes", "what": name, "number": count, "seconds": each}
 
 
 def with_slopes(rows: Iterable[Row]) -> Iterator[Row]:

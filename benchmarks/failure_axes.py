@@ -1,8 +1,7 @@
 """Where methods may fail: nine pairs of axes, and the scene of every cell.
 
-Every cell differs from the middle of the ladder, 60 dB, three periods at 200 kHz, delays of 50 ns
-rms, in its row and its column. It has one calibration, and trials with dry and damp skin by turns,
-which share the driver identified from it.
+Every cell differs from the middle of the ladder in its row and its column. It has one calibration,
+and trials with dry and damp skin by turns, which share the driver identified from it.
 """
 
 import dataclasses

@@ -1,9 +1,8 @@
 """Damaged files: crashes, hangs, memory and errors that are not etid's own.
 
-Every file is a good one that was damaged as its kind and seed say. Child processes read thousands
-of them each; one that takes longer than `--limit`, dies, or allocates more than a gigabyte is
-counted and named by kind and seed, and `--kind KIND --first SEED --files 1` repeats it. What may
-come out is an answer or one `etid.RecordingError`.
+Child processes read thousands of them each; one that takes longer than `--limit`, dies, or
+allocates more than a gigabyte is counted and named by kind and seed, and `--kind KIND --first SEED
+--files 1` repeats it. What may come out is an answer or one `etid.RecordingError`.
 """
 
 import argparse

@@ -3,8 +3,7 @@
 One pinned core, samples in ordinary arrays, as many pulses as asked for after a warm-up. The pulses
 differ in noise, trigger delay and sampling phase. filterpy's extended Kalman filter tracks the same
 pulses with the same model in the same run, in an environment of its own (`.rivals`). Then follow
-false alarms and the detection of wet skin (`benchmarks.online_alarms`). The table is `online.csv`.
-A missed target makes the command end with 1.
+false alarms and the detection of wet skin (`benchmarks.online_alarms`).
 """
 
 import argparse
@@ -18,7 +17,7 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
-from benchmarks.machine import RESULTS, write_csv
+from benchmarks.machine import RESULTS
 from benchmarks.online_alarms import LIFTED, LOADS, SOON, Fingertip, alarms
 from benchmarks.rivals import RivalError, exchange, make
 from benchmarks.runner import Target, at_least, at_most, option, report
@@ -57,11 +56,7 @@ def main(arguments: argparse.Namespace) -> bool:
     found = list(ticks(electrodes, arguments.lifted, arguments.ticks))
     for snr_db in NOISES if hours > 0 else ():
         found += tests(electrodes, snr_db, hours)
-    rows = [
-        {"quantity": of.name, "value": of.value, "least": of.least, "most": of.most} for of in found
-    ]
-    write_csv(arguments.output, rows)
-    return report(found)
+    return report(found, arguments.output)
 
 
 def named(name: str, value: float, of: str = "") -> Target:
@@ -133,13 +128,8 @@ def seconds_of_filterpy(
 ) -> float:
     """Median processor time of filterpy for one pulse at all electrodes, the bands apart [s].
 
-    Args:
-        tracker: Tracker of `SkinRC` whose model is used.
-        pulses: Windows of the first pulses after a start [V].
-        logs: Logarithms of the elements that the tracker has found.
-
-    Raises:
-        RivalError: filterpy cannot be installed or run.
+    Its filters start near the logarithms that the tracker has found; a `RivalError` if there is no
+    filterpy.
     """
     missing = make(ENVIRONMENT)
     if missing:

@@ -2,12 +2,8 @@
 
 The noise of every pulse and electrode is drawn anew; the delays are those of `DRAWS` triggers, and
 the sampling phase is that of the pulse. The skin does not change, and the tracker expects that: its
-statistics then have the distribution of the tests. `pytest tests/test_online.py -k innovations`
-does the same for skin that varies, in a linear scene.
-
-The unloaded record has twelve periods. Its noise is common to all pulses and no part of the tests:
-with three periods, two pulses of four electrode hours exceeded the limit. Each made two alarms, the
-second when the electrode returned to its value.
+statistics then have the distribution of the tests. The noise of the unloaded record, of twelve
+periods, is common to all pulses and no part of the tests.
 """
 
 import dataclasses
@@ -56,13 +52,7 @@ class Alarms:
 
 
 class Fingertip:
-    """Pulses of a display at one noise.
-
-    Args:
-        electrodes: Number of electrodes.
-        snr_db: Signal-to-noise ratio [dB].
-        change: Random walk that the tracker expects [1/√pulse].
-    """
+    """Pulses of a display at one noise; `change` is the random walk that the tracker expects."""
 
     def __init__(self, electrodes: int, snr_db: float, change: float = 0.0) -> None:
         noisy = Scene((), TWO, snr_db=snr_db, trigger_jitter_rms=JITTER, samples=UNLOADED)
@@ -94,13 +84,7 @@ class Fingertip:
 
 
 def alarms(electrodes: int, snr_db: float, hours: float) -> Alarms:
-    """Simulate a display.
-
-    Args:
-        electrodes: Number of electrodes.
-        snr_db: Signal-to-noise ratio [dB].
-        hours: Electrode hours without a change.
-    """
+    """Simulate a display for so many electrode hours without a change."""
     display = Fingertip(electrodes, snr_db)
     tracker = display.tracker
     loads = np.arange(electrodes) % len(LOADS)

@@ -4,11 +4,8 @@ Five laboratories make the same recordings. `good` has 60 dB and one clock. Each
 has one thing worse: white noise of 40 or of 30 dB, or trigger delays of 200 ns (rms) in every
 record, the calibration included. `both`, with 40 dB and 200 ns, is where the paper's method errs as
 much as the paper prints. The tables put the two causes apart: noise biases Steiglitz-McBride, the
-same in every trial; delays spread its trials.
-
-A study is made several times, each with a calibration of its own. `--source spice` takes its
-waveforms from ngspice. `table_4.svg` shows error and scatter of the built circuit by cause; `make
-demo` makes all tables and figures of the paper.
+same in every trial; delays spread its trials. A study is made several times, each with a
+calibration of its own. `table_4.svg` shows error and scatter of the built circuit by cause.
 
 Rows are tidy: one per laboratory, method and element, beside what the paper prints. Errors, spreads
 and scatters are in per cent. A fit without a circuit (an estimate that is negative or complex)
@@ -99,14 +96,6 @@ def _mean(values: Iterable[float]) -> float:
     return float(np.mean(finite)) if finite else np.nan
 
 
-def _counts(every: Sequence[etid.Fits]) -> Row:
-    return {
-        "successful": sum(len(fits.successful()) for fits in every),
-        "circuits": sum(len(_with_circuit(fits)) for fits in every),
-        "fits": sum(map(len, every)),
-    }
-
-
 def table_1(groups: Groups) -> list[Row]:
     """Errors of five known resistors, over the studies."""
     rows = []
@@ -143,7 +132,12 @@ def table_4(groups: Groups, truth: Truth) -> list[Row]:
             row["scatter"] = float(np.sqrt(_mean(errors.var(ddof=1) for errors in found)))
             row["stderr"] = _mean(_stderr_of_mean(fits, truth, i) for fits in some)
             row["rrse"] = 100 * float(np.median([np.median(fits.rrse) for fits in every]))
-            rows.append({**row, **_counts(every), "studies": len(some)})
+            counts = {
+                "successful": sum(len(fits.successful()) for fits in every),
+                "circuits": sum(len(_with_circuit(fits)) for fits in every),
+                "fits": sum(map(len, every)),
+            }
+            rows.append({**row, **counts, "studies": len(some)})
     return sorted(rows, key=lambda row: ORDER.index(row["element"]))
 
 
@@ -155,20 +149,16 @@ def _stderr_of_mean(fits: etid.Fits, truth: Truth, i: int) -> float:
 
 
 def show(rows: Sequence[Row], columns: Sequence[str]) -> Table:
-    """A table for the terminal: the laboratory, the method, and these columns of the rows."""
+    """A table for the terminal; resistances in the unit in which circuits are printed."""
+    scale, symbol = DISPLAY["ohm"]
+
+    def cell(name: str, value: Any) -> str:
+        if not isinstance(value, float):
+            return str(value)
+        return f"{value / scale:.4g} {symbol}" if name == "r" else number(value)
+
     heads = ("laboratory", "method", *columns)
-    return Table(heads, tuple(tuple(_cell(name, row) for name in heads) for row in rows))
-
-
-def _cell(name: str, row: Row) -> str:
-    """One cell; resistances in the unit in which circuits are printed."""
-    value = row[name]
-    if not isinstance(value, float):
-        return str(value)
-    if name == "r":
-        scale, symbol = DISPLAY["ohm"]
-        return f"{value / scale:.4g} {symbol}"
-    return number(value)
+    return Table(heads, tuple(tuple(cell(name, row[name]) for name in heads) for row in rows))
 
 
 def targets(first: Sequence[Row], fourth: Sequence[Row]) -> Iterator[Target]:

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import scipy.stats
 
 from benchmarks import visibility
-from benchmarks.disturbances import Hum, Offset, Spike
+from benchmarks.disturbances import Hum, Leaky, Offset, Spike
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import (
@@ -28,7 +28,6 @@ from benchmarks.perturbed_study import (
     coherent,
     crosstalk,
     late,
-    leaking,
     longer,
     louder,
     nonlinear,
@@ -167,25 +166,18 @@ CLOCKS: Mapping[str, Change] = {
 SKINS: Mapping[str, Change] = {
     **{
         f"{name}_{kind}_{fall:g}": changing(element, fall, kind == "step")
-        for name, element, kind, fall in (
-            ("rp", "r_p", "linear", 0.05),
-            ("rp", "r_p", "step", 0.05),
-            ("rs", "r_s", "linear", 0.05),
-            ("rs", "r_s", "step", 0.05),
-            ("rp", "r_p", "linear", 0.2),
-            ("rp", "r_p", "step", 0.2),
-            ("rs", "r_s", "linear", 0.2),
-            ("rs", "r_s", "step", 0.2),
-            ("cp", "c_p", "linear", 0.05),
-        )
+        for fall in (0.05, 0.2)
+        for name, element in (("rp", "r_p"), ("rs", "r_s"))
+        for kind in ("linear", "step")
     },
+    "cp_linear_0.05": changing("c_p", 0.05, False),
     "rp_linear_0.05_six_periods": longer(changing("r_p", 0.05, False, 6)),
     "rs_step_0.2_six_periods": longer(changing("r_s", 0.2, True, 6)),
     "Rp_nonlinear_0.2": nonlinear(0.2),
     "Rp_nonlinear_0.4": nonlinear(0.4),
     "cole_alpha0.8": skin_is(functools.partial(Cole, alpha=0.8), words=True),
     "two_rc_mid": skin_is(functools.partial(TwoLayers, share=0.3), words=True),
-    "leak_100Rp": skin_is(leaking),
+    "leak_100Rp": skin_is(lambda skin: Leaky(skin, 100 * skin.r_p)),
 }
 
 _ALL_PARTS = ("r_protection", "r_secondary", "l_secondary", "l_magnetising", "r_source")
@@ -231,20 +223,12 @@ class Invisible:
     """Why a perturbation is not seen."""
 
     why: str  # by how much the elements are wrong, and the reason
-    # of the records. As many silent answers are excused as the best test would miss; None if no
-    # test can see it at all
+    # as many silent answers are excused as the best test of it would miss; all if there is no test
     change: visibility.Change | None = None
     snr_db: float = math.inf  # largest at which it is so [dB]
 
     def excuses(self, path: str, snr_db: float, silent: int, answers: int) -> bool:
-        """Whether so many silent answers are as many as the best test would give, or less.
-
-        Args:
-            path: Of the skin.
-            snr_db: Of the noise [dB].
-            silent: Answers that are silent.
-            answers: All of them, each behind a driver of its own.
-        """
+        """Whether the best test, too, would be silent so often, behind the skin of this path."""
         if self.change is None:
             return snr_db <= self.snr_db
         missed = visibility.missed(LOADS[path], snr_db, self.change)

@@ -1,9 +1,5 @@
 """What a laboratory does to recordings: is any answer wrong without saying so?
 
-    python -m benchmarks perturbations                       # all of it, in two processes
-    python -m benchmarks perturbations --only base hum60_0.02V_all --drivers 3 --snr-db 60
-    python -m benchmarks perturbations --quick               # few perturbations, in a minute
-
 Each perturbation (`benchmarks.perturbation_list`) is done to studies of several drivers, dry and
 damp skin behind each. An answer is *right* if every element is within five of its own standard
 errors of the truth and, where the bound of its standard error is 10 % at most, within 20 % of it.
@@ -12,10 +8,9 @@ called successful, and *silent* if it is wrong and called successful. An element
 a record is wrong if one of its values is farther away than that; if the fit remarks on something
 in the recording, any of them will do. A method without standard errors is held to the bound.
 
-Written are `perturbations.csv`, one row for each perturbation, noise, skin and method, and
-`perturbations.svg`. The targets: no silent answer but for the perturbations of `INVISIBLE`, of
-which no more are silent than the best possible test would miss (`benchmarks.visibility`), and at
-most 2 % of the undisturbed recordings refused.
+The targets: no silent answer but for the perturbations of `INVISIBLE`, of which no more are silent
+than the best possible test would miss (`benchmarks.visibility`), and at most 2 % of the undisturbed
+recordings refused.
 """
 
 import argparse
@@ -91,10 +86,7 @@ def kind(of: Answer) -> str:
 def error_of(values: np.ndarray, truth: Truth, remarked: bool) -> np.ndarray:
     """Relative errors of an answer; 0 where the truth has no such element.
 
-    Args:
-        values: The elements that are said.
-        truth: What is right.
-        remarked: Whether the answer says that something was wrong with the recording.
+    What moves is near enough everywhere in its range, if the answer has remarked on the recording.
     """
     to_low, to_high = values / truth.low - 1, values / truth.high - 1
     inside = (to_low >= 0) & (to_high <= 0)
@@ -213,11 +205,7 @@ def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     for row in sorted(rows, key=lambda row: (row["path"], row["snr_db"]), reverse=True):
         panel = panels.setdefault(f"{row['path']}, {row['snr_db']:g} dB", {})
         panel[_label(row["perturbation"])] = {kind: row[kind] for kind in KINDS}
-    order = list(dict.fromkeys(_label(row["perturbation"]) for row in rows))
-    sorted_panels = {
-        name: {row: of[row] for row in order if row in of} for name, of in panels.items()
-    }
-    charts.shares(sorted_panels, charts.ANSWERS, path)
+    charts.shares(panels, charts.ANSWERS, path)
 
 
 def _label(name: str) -> str:

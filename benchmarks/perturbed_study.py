@@ -1,7 +1,5 @@
 """A study in which all is well, and the ways to change it.
 
-`undisturbed` draws a study in which all is well: dry and damp skin, 98.8 kΩ, three periods at
-200 kHz, trigger delays of 50 ns rms, parts of the driver 3 % from those of `TransformerDriver`.
 A `Change` is a function from that study to another; `benchmarks.perturbation_list` has them all.
 """
 
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.disturbances import Leaky, Nonlinear, Pink, Shunted, Tail
+from benchmarks.disturbances import Nonlinear, Pink, Shunted, Tail
 from benchmarks.laboratory import CORNER, SCALE, Crosstalk, Output, Record, noise
 from benchmarks.ladder import LOADS
 from etid.simulation.published import REFERENCE
@@ -34,12 +32,8 @@ class Truth:
 
     low: Float[np.ndarray, " element"]  # smallest value of each element in the record
     high: Float[np.ndarray, " element"]  # largest
-    # whether it went from the one to the other: an answer that does not say so claims that the
-    # elements were what it gives all the time
-    moves: bool = False
-    # whether the elements are a matter of words, as of skin that is not one RC: they are wrong by
-    # 20 % only
-    words: bool = False
+    moves: bool = False  # whether it went from the one to the other, which an answer has to say
+    words: bool = False  # whether the elements are a matter of words: wrong by 20 % only
 
     @classmethod
     def of(cls, *skins: SkinLoad, **more: bool) -> "Truth":
@@ -62,13 +56,7 @@ Change = Callable[[Study], Study]
 
 
 def drawn_driver(number: int, spread: float, usual: TransformerDriver) -> TransformerDriver:
-    """One of many transformers of a kind.
-
-    Args:
-        number: Of the driver; equal numbers are equal drivers.
-        spread: Standard deviation of the logarithm of every part.
-        usual: The medians of the parts, and what all have in common: pulse and turns.
-    """
+    """One of many transformers, whose parts have this standard deviation of their logarithms."""
     rng = np.random.default_rng([number, *b"driver"])
     parts = {
         field.name: getattr(usual, field.name) * float(np.exp(spread * rng.standard_normal()))
@@ -79,11 +67,9 @@ def drawn_driver(number: int, spread: float, usual: TransformerDriver) -> Transf
 
 
 def undisturbed(number: int, snr_db: float) -> Study:
-    """The study of one driver.
+    """The study of one driver: dry and damp skin, 98.8 kΩ, three periods at 200 kHz.
 
-    Args:
-        number: Of the driver; parts and delays are drawn from it.
-        snr_db: Of every record [dB].
+    Its parts differ by 3 % from those of `TransformerDriver`.
     """
     driver = drawn_driver(number, PARTS, TransformerDriver())
     rng = np.random.default_rng([number, *b"delays"])
@@ -246,10 +232,7 @@ def longer(change: Change = lambda study: study) -> Change:
 
 
 def coherent(antialias: float = CORNER) -> Change:
-    """Record with a whole number of samples in each period, 240 kHz at 60 Hz.
-
-    `antialias` is the corner of the anti-alias filter, relative to the sample rate.
-    """
+    """Record a whole number of samples in each period; `antialias` is of the sample rate."""
     rate = {"sample_rate": COHERENT_RATE, "samples": round(PERIODS * COHERENT_RATE / 60)}
 
     def change(study: Study) -> Study:
@@ -284,8 +267,3 @@ def shunted(c: float) -> Callable[[Record], Record]:
 def single(change: Change) -> Change:
     """Record one period and a little more."""
     return lambda study: change(all_records(record(samples=3_400))(study))
-
-
-def leaking(skin: SkinLoad) -> Leaky:
-    """Skin with a leak of a hundred times its R_p across it."""
-    return Leaky(skin, 100 * skin.r_p)

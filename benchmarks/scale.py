@@ -2,9 +2,8 @@
 
 Every measurement is a job in a process of its own, whose peak memory is the job's, on as many cores
 as it has workers: `python -m benchmarks.scale JOB` with a JSON object prints another. The file lies
-in the page cache, which flatters reading; reading alone is h5py, recording after recording.
-Compilation is in no time but `start` and the CPU time of workers, which tells of other work on the
-machine.
+in the page cache, which flatters reading. Compilation is in no time but `start` and the CPU time of
+workers, which tells of other work on the machine.
 """
 
 import argparse
@@ -58,8 +57,6 @@ OPTIONS = (
 
 
 def _by_h5py(file: str, whole_stacks: bool) -> None:
-    """Read all samples with h5py alone, one recording after the other or a stack at once."""
-
     def visit(_: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and (item.ndim == 1 or whole_stacks):
             item[()]
@@ -72,7 +69,6 @@ def _by_h5py(file: str, whole_stacks: bool) -> None:
 
 
 def _by_etid(file: str) -> None:
-    """Load all recordings."""
     with etid.read(file) as study:
         for _ in study.recordings():
             pass
@@ -267,15 +263,14 @@ def resume(plan: Plan) -> Resumed:
 
 def _same(one: pathlib.Path, other: pathlib.Path) -> bool:
     """Whether two files hold the same arrays, bit for bit."""
+
+    def bits(column: np.ndarray) -> Any:  # texts are objects, whose bits are addresses
+        return column.tolist() if column.dtype.hasobject else column.tobytes()
+
     with h5py.File(one) as a, h5py.File(other) as b:
         return set(a) == set(b) and all(
-            _bits(np.asarray(a[name])) == _bits(np.asarray(b[name])) for name in a
+            bits(np.asarray(a[name])) == bits(np.asarray(b[name])) for name in a
         )
-
-
-def _bits(column: np.ndarray) -> Any:
-    """What is equal if all bits are, NaN too; texts are objects, whose bits are addresses."""
-    return column.tolist() if column.dtype.hasobject else column.tobytes()
 
 
 def targets(table: Sequence[dict[str, Any]], resumed: Resumed) -> Iterator[Target]:

@@ -107,12 +107,7 @@ def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Sele
 
 
 def draws(snr_db: float, number: int) -> list[Drawn]:
-    """One recording of each truth; none if the driver is not identified.
-
-    Args:
-        snr_db: Of every record [dB].
-        number: Of the driver, and the seed of the records.
-    """
+    """One recording of each truth behind a driver [dB]; none if the driver is not identified."""
     with jax.enable_x64(True):  # of a worker process
         study = scene(snr_db, number).simulate(number)
         driver = etid.identify_driver(study["calibration"], throw=False)

@@ -57,18 +57,17 @@ class Draws(NamedTuple):
     truth: np.ndarray
     bound: np.ndarray
 
+    @classmethod
+    def of(cls, scene: Scene, repetitions: int, source: Callable[[Scene, int], etid.Study]):
+        """Record a scene with one seed after the other, from 0 on."""
+        truth, bound = scene.truth()[TRIAL], etid.bound(scene)[TRIAL].relative
+        studies = [source(scene, seed) for seed in range(repetitions)]
+        return cls(studies, *(np.array(list(of.values())) for of in (truth, bound)))
+
     def answer(self, name: str, seed: int, verdict: str, value: Any, stderr: Any) -> Answer:
         """What an estimator says of a draw."""
         error, own = (np.asarray(of, float) / self.truth for of in (value, stderr))
         return Answer(name, seed, TRIAL, verdict, error - 1, own, self.bound)
-
-
-def draw(scene: Scene, repetitions: int, source: Callable[[Scene, int], etid.Study]) -> Draws:
-    """Record a scene with one seed after the other, from 0 on."""
-    bound = list(etid.bound(scene)[TRIAL].relative.values())
-    truth = list(scene.truth()[TRIAL].values())
-    studies = [source(scene, seed) for seed in range(repetitions)]
-    return Draws(studies, np.array(truth), np.array(bound))
 
 
 class Result(NamedTuple):
@@ -111,14 +110,7 @@ class Result(NamedTuple):
 
 
 def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[Result]:
-    """One of our estimators, alone and batched.
-
-    Args:
-        draws: The recordings.
-        drivers: Their drivers.
-        name: Of the estimator.
-        budget: Time [s] after which the other draws are left out, but for `FEWEST`.
-    """
+    """One of our estimators, alone and batched; after the budget [s] other draws are left out."""
     method, begin = method_of(name), np.inf
     answers, usable, times = [], [], []
     for seed, study in enumerate(draws.studies):
@@ -189,7 +181,7 @@ def theirs(draws: Draws, budget: float) -> Iterator[Result]:
 
 def rows_of(name: str, source: str, repetitions: int, quick: bool) -> list[dict[str, Any]]:
     """One row for each estimator and mode in one scene; `quick` leaves out batches and rivals."""
-    draws, drivers = draw(ladder()[name], repetitions, SOURCES[source]), Drivers()
+    draws, drivers = Draws.of(ladder()[name], repetitions, SOURCES[source]), Drivers()
     modes = 1 if quick else None
     results = [
         result

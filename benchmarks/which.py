@@ -94,11 +94,7 @@ def _draws(rows: Sequence[Row]) -> str:
 
 
 def inserted(text: str, made: str) -> str:
-    """A page with the table between its marks.
-
-    Raises:
-        ValueError: The page has no marks.
-    """
+    """A page with the table between its marks; a `ValueError` if it has none."""
     head, begin, rest = text.partition(BEGIN)
     _, end, tail = rest.partition(END)
     if not (begin and end):

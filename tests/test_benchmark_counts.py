@@ -23,7 +23,7 @@ from benchmarks import (
 from benchmarks.estimators import NOTHING, Answer
 from benchmarks.failure_axes import MOST, cells
 from benchmarks.ladder import LOADS
-from benchmarks.machine import RESULTS, write_csv
+from benchmarks.machine import RESULTS
 from benchmarks.online_alarms import Alarms
 from benchmarks.perturbed_study import Truth
 from benchmarks.rates import clopper_pearson, expected_covered, expected_rms, rate
@@ -355,16 +355,3 @@ def test_the_first_that_is_good_is_to_be_used_or_what_is_as_good_in_half_its_tim
 def test_the_readme_has_the_table_of_the_last_results():
     made, page = which.table(which.read(RESULTS / speed_accuracy.FILE)), which.README.read_text()
     assert which.inserted(page, made) == page, "run python -m benchmarks which"
-
-
-def test_one_map_anew_keeps_the_others_with_the_commit_of_their_run(tmp_path):
-    every = {cell.chart: cell for cell in cells()}
-    old, new = every["SNR and periods"], every["SNR and sample rate"]
-    path, of = tmp_path / failure_map.RATES, [answer(FAR)]
-    write_csv(path, [{**row, "commit": "earlier"} for row in failure_map.table(old, of)])
-    kept = failure_map.earlier(path, [new.chart])
-    write_csv(path, failure_map.in_order([*kept, *failure_map.table(new, of)]))
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["map"] for row in rows] == [new.chart, old.chart]
-    assert rows[0]["commit"] != rows[1]["commit"] == "earlier"
