@@ -8,6 +8,7 @@ environment of its own (`.rivals`).
 """
 
 import argparse
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import erf
 
 import etid
+from benchmarks.machine import timed
 from benchmarks.rivals import exchange, make
 from benchmarks.runner import Target, at_most, option, report
 from etid.circuits.current_dependent import Norton, Signals, port
@@ -176,15 +178,10 @@ def by_balance(case: Case, truth: np.ndarray, finer: int) -> Line:
     """Harmonic balance, timed."""
     logs, function = case.skin.log_values(), jax.jit(balanced(case, finer))
     first, seconds = 0.0, list[float]()
-    for call in (function, jax.jit(jax.jacfwd(function))):
-        begin = time.perf_counter()
-        jax.block_until_ready(call(logs))
-        first += time.perf_counter() - begin
-        runs = []
-        for _ in range(REPEATS):
-            begin = time.process_time()
-            jax.block_until_ready(call(logs))
-            runs.append(time.process_time() - begin)
+    for of in (function, jax.jit(jax.jacfwd(function))):
+        call = functools.partial(of, logs)
+        first += timed(call)[1]
+        runs = [timed(call, time.process_time)[1] for _ in range(REPEATS)]
         seconds.append(float(np.median(runs)))
     error = _error(np.asarray(function(logs)), truth)
     alone, with_slopes = seconds

@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 import etid
 from benchmarks.coverage import identified, targets
-from benchmarks.disturbances import Hum
-from benchmarks.laboratory import Added, Record
+from benchmarks.disturbances import Added, hum
+from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import all_records, both, out, undisturbed
 from benchmarks.runner import Target, option, report
@@ -56,8 +56,8 @@ KINDS: Mapping[str, Callable[[Record], Record]] = {
     "1/f, 10 kHz": lambda of: both(added=(Flicker(of.sigma, 1e4),))(of),
     "1/f, 10 kHz, V_out only": lambda of: out(added=(Flicker(of.sigma, 1e4),))(of),
     "V_out three times as loud": lambda of: out(added=(white(8**0.5 * of.sigma),))(of),
-    "hum of 50 Hz": lambda of: both(added=(Hum(50.0, HUM),))(of),
-    "hum of 60 Hz": lambda of: both(added=(Hum(60.0, HUM),))(of),
+    "hum of 50 Hz": lambda of: both(added=(hum(50.0, HUM),))(of),
+    "hum of 60 Hz": lambda of: both(added=(hum(60.0, HUM),))(of),
 }
 
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import scipy.stats
 
 from benchmarks import visibility
-from benchmarks.disturbances import Hum, Leaky, Offset, Spike
+from benchmarks.disturbances import Leaky, hum, offset, spike
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import (
@@ -60,30 +60,30 @@ UNDISTURBED: Mapping[str, Change] = {
 def _hum(amplitude: float) -> dict[str, Change]:
     said = f"{amplitude:g}V"
     return {
-        f"hum60_{said}_all": all_records(both(added=(Hum(60.0, amplitude),))),
-        f"hum60_{said}_out_skin_only": trials(out(added=(Hum(60.0, amplitude),))),
-        f"hum50_{said}_all": all_records(both(added=(Hum(50.0, amplitude),))),
+        f"hum60_{said}_all": all_records(both(added=(hum(60.0, amplitude),))),
+        f"hum60_{said}_out_skin_only": trials(out(added=(hum(60.0, amplitude),))),
+        f"hum50_{said}_all": all_records(both(added=(hum(50.0, amplitude),))),
     }
 
 
-_LOCKED = Hum(60.0, 0.02, phase=0.2)
+_LOCKED = hum(60.0, 0.02, phase=0.2)
 NUISANCES: Mapping[str, Change] = {
     **_hum(0.002),
     **_hum(0.02),
     **_hum(0.1),
-    "hum60h_100mV_all": all_records(both(added=(Hum(60.0, 0.1, (2, 3, 5)),))),
+    "hum60h_100mV_all": all_records(both(added=(hum(60.0, 0.1, (2, 3, 5)),))),
     "hum60_20mV_phase_locked_th_and_out": all_records(both(added=(_LOCKED,))),
-    "dc_0.5V_all": all_records(both(added=(Offset(0.5),))),
-    "wander1Hz_50mV": all_records(both(added=(Hum(1.0, 0.05),))),
-    "wander1Hz_500mV": all_records(both(added=(Hum(1.0, 0.5),))),
-    "spike_0.5V_5ms_out": trials(out(added=(Spike(0.5, 5e-3),))),
-    "spike_0.1V_5ms_out": trials(out(added=(Spike(0.1, 5e-3),))),
-    "spike_1V_5ms_out": trials(out(added=(Spike(1.0, 5e-3),))),
-    "spike_1V_0.1ms_out": trials(out(added=(Spike(1.0, 1e-4),))),
-    "spike_1V_5ms_out_six_periods": longer(trials(out(added=(Spike(1.0, 5e-3),)))),
-    "spike_0.1V_5ms_th_six_periods": longer(trials(th(added=(Spike(0.1, 5e-3),)))),
-    "jump_0.5V_5ms_out": trials(out(added=(Spike(0.5, 5e-3, rectangular=True),))),
-    "jump_1V_5ms_out": trials(out(added=(Spike(1.0, 5e-3, rectangular=True),))),
+    "dc_0.5V_all": all_records(both(added=(offset(0.5),))),
+    "wander1Hz_50mV": all_records(both(added=(hum(1.0, 0.05),))),
+    "wander1Hz_500mV": all_records(both(added=(hum(1.0, 0.5),))),
+    "spike_0.5V_5ms_out": trials(out(added=(spike(0.5, 5e-3),))),
+    "spike_0.1V_5ms_out": trials(out(added=(spike(0.1, 5e-3),))),
+    "spike_1V_5ms_out": trials(out(added=(spike(1.0, 5e-3),))),
+    "spike_1V_0.1ms_out": trials(out(added=(spike(1.0, 1e-4),))),
+    "spike_1V_5ms_out_six_periods": longer(trials(out(added=(spike(1.0, 5e-3),)))),
+    "spike_0.1V_5ms_th_six_periods": longer(trials(th(added=(spike(0.1, 5e-3),)))),
+    "jump_0.5V_5ms_out": trials(out(added=(spike(0.5, 5e-3, rectangular=True),))),
+    "jump_1V_5ms_out": trials(out(added=(spike(1.0, 5e-3, rectangular=True),))),
     "tail_5mV_5ms": all_records(tail(5e-3, 5e-3)),
     "tail_5mV_5ms_skin": trials(tail(5e-3, 5e-3)),
     "crosstalk_1%_neighbour": trials(crosstalk(4e-3)),

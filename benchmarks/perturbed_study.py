@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.disturbances import Nonlinear, Pink, Shunted, Tail
-from benchmarks.laboratory import CORNER, SCALE, Crosstalk, Output, Record, noise
+from benchmarks import disturbances
+from benchmarks.disturbances import Nonlinear
+from benchmarks.laboratory import CORNER, SCALE, Output, Record, noise
 from benchmarks.ladder import LOADS
 from etid.simulation.published import REFERENCE
 from etid.simulation.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
@@ -147,7 +148,16 @@ def louder(factor: float) -> Callable[[Record], Record]:
 
 def crosstalk(later: float) -> Callable[[Record], Record]:
     """Let the loaded voltage see 1 % of an unloaded one whose pulse is later by so much [s]."""
-    return lambda of: out(added=(Crosstalk(of.th, 0.01, later),))(of)
+
+    def change(of: Record) -> Record:
+        other = dataclasses.replace(of.th, delay=of.th.delay - later)
+
+        def seen(time: Float[np.ndarray, " time"], rng: np.random.Generator):
+            return 0.01 * other.volts(of.sample_rate, time.size, rng)
+
+        return out(added=(seen,))(of)
+
+    return change
 
 
 def _other(change: Callable[[Record], Record], truth: Callable[[str], Truth]) -> Change:
@@ -245,7 +255,7 @@ def coherent(antialias: float = CORNER) -> Change:
 
 def pink(of: Record) -> Record:
     """Both voltages with 1/f noise of three times the effective value of the white noise."""
-    return both(added=(Pink(3 * of.sigma),))(of)
+    return both(added=(disturbances.pink(3 * of.sigma),))(of)
 
 
 def tail(height: float, time_constant: float) -> Callable[[Record], Record]:
@@ -253,15 +263,19 @@ def tail(height: float, time_constant: float) -> Callable[[Record], Record]:
 
     def change(of: Record) -> Record:
         driver = of.out.driver
-        end = driver.lead_in + driver.width
-        return out(added=(Tail(SCALE * height, time_constant, end, 1 / PULSE_RATE),))(of)
+        times = time_constant, driver.lead_in + driver.width, 1 / PULSE_RATE
+        return out(added=(disturbances.tail(SCALE * height, *times),))(of)
 
     return change
 
 
 def shunted(c: float) -> Callable[[Record], Record]:
     """Put a capacitor [F] across every load."""
-    return lambda of: out(loads=tuple(Shunted(load, c) for load in of.out.loads))(of)
+
+    def across(load: Impedance) -> Impedance:
+        return lambda f: load(f) / (1 + 2j * np.pi * f * c * load(f))
+
+    return lambda of: out(loads=tuple(map(across, of.out.loads)))(of)
 
 
 def single(change: Change) -> Change:

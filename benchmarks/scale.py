@@ -27,7 +27,7 @@ import numpy as np
 
 import etid
 from benchmarks.large_file import LAYOUTS, large_file
-from benchmarks.machine import ROOT, cores, write_csv
+from benchmarks.machine import ROOT, cores, timed, write_csv
 from benchmarks.runner import QUICK, Target, at_least, at_most, option, report
 from etid.estimators.registry import names
 from etid.identify import file as streaming
@@ -91,13 +91,13 @@ def _fit(job: dict[str, Any]) -> dict[str, Any]:
         if job["warm"]:
             target = pathlib.Path(job["target"]).with_suffix(".warm.h5")
             streaming.PART = job["warm_part"]
-            start = _timed(lambda: streaming.fit_file(job["warm"], target, **arguments))[1]
+            start = timed(lambda: streaming.fit_file(job["warm"], target, **arguments))[1]
             target.unlink()
         streaming.PART = job["part"]
         if job["log"]:
             _log_parts(job["log"])
         arguments["resume"], before = job["resume"], time.process_time()
-        outcome, seconds = _timed(
+        outcome, seconds = timed(
             lambda: streaming.fit_file(job["file"], job["target"], **arguments)
         )
         cpu = time.process_time() - before
@@ -119,18 +119,12 @@ def _log_parts(log: str) -> None:
     streaming.identify_part = logged
 
 
-def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    begin = time.perf_counter()
-    found = call()
-    return found, time.perf_counter() - begin
-
-
 def done(job: dict[str, Any]) -> dict[str, Any]:
     """Do a job; seconds, and peak memory of this process and of its largest child [B]."""
     if job["what"] == "fit":
         found = _fit(job)
     else:
-        found = {"seconds": _timed(lambda: READERS[job["what"]](job["file"]))[1]}
+        found = {"seconds": timed(lambda: READERS[job["what"]](job["file"]))[1]}
     own, children = (
         1024 * resource.getrusage(who).ru_maxrss
         for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
@@ -144,9 +138,7 @@ class Plan(NamedTuple):
     folder: pathlib.Path  # where the files are or will be
     recordings: int  # how many in a file
     part: int  # how many are written at once
-    # estimators; None is the default one. The last is run in all layouts
-    methods: Sequence[str | None]
-    killed: str | None  # estimator of the run that is killed
+    methods: Sequence[str | None]  # None is the default one; the last is killed, in all layouts run
 
 
 def _start(folder: pathlib.Path, job: dict[str, Any]) -> subprocess.Popen[bytes]:
@@ -231,7 +223,7 @@ class Resumed(NamedTuple):
 
 def resume(plan: Plan) -> Resumed:
     """Kill a run at seeded moments, resume it, and compare with a run that was left alone."""
-    job = fit_job(plan, "contiguous", plan.killed, 1) | {"warm": ""}
+    job = fit_job(plan, "contiguous", plan.methods[-1], 1) | {"warm": ""}
     whole, target = (plan.folder.absolute() / f"{name}.h5" for name in ("whole", "resumed"))
     log = target.with_suffix(".log")
     log.unlink(missing_ok=True)
@@ -289,11 +281,11 @@ def targets(table: Sequence[dict[str, Any]], resumed: Resumed) -> Iterator[Targe
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table, write it as CSV; whether every target is met."""
-    chosen = [None if name == "default" else name for name in arguments.method]
-    plan = Plan(arguments.folder, arguments.recordings, streaming.PART, chosen, chosen[-1])
+    names, recordings, part = arguments.method, arguments.recordings, streaming.PART
     if arguments.quick:
-        quick = "equation_error"
-        plan = Plan(arguments.folder, min(arguments.recordings, 400), 32, (quick,), quick)
+        names, recordings, part = METHODS[1:], min(recordings, 400), 32
+    methods = [None if name == "default" else name for name in names]
+    plan = Plan(arguments.folder, recordings, part, methods)
     table: list[dict[str, Any]] = []
     for row in rows(plan):
         table.append(row)

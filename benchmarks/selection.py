@@ -23,7 +23,7 @@ from benchmarks import selection_counts as counts
 from benchmarks.estimators import Answer
 from benchmarks.failure_axes import Cell
 from benchmarks.failure_draws import AUTO, Effort, answers
-from benchmarks.machine import median_time, write_csv
+from benchmarks.machine import median_time, timed, write_csv
 from benchmarks.perturbed_study import DELAY
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
 from benchmarks.runner import (
@@ -139,13 +139,12 @@ def time_ratios(pairs: int) -> Iterator[Target]:
 
         for of, call in zip(ratios.values(), (in_batch, one_by_one), strict=True):
             for number in range(pairs + 1):
-                seconds = []
-                for circuit in (None, "auto"):
-                    begin = time.process_time()
-                    call(circuit)
-                    seconds.append(time.process_time() - begin)
+                plain, auto = (
+                    timed(functools.partial(call, circuit), time.process_time)[1]
+                    for circuit in (None, "auto")
+                )
                 if number:  # the first pair compiles
-                    of.append(seconds[1] / seconds[0])
+                    of.append(auto / plain)
     for name, of in ratios.items():
         low, middle, high = np.quantile(of, (0.25, 0.5, 0.75))
         text = f"{middle:.2f} (quartiles {low:.2f} to {high:.2f}) of {len(of)} pairs"

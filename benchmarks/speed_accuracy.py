@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -20,7 +19,7 @@ import etid
 from benchmarks import rivals
 from benchmarks.estimators import DEFAULT, ELEMENTS, NOTHING, OURS, Answer, Drivers, method_of
 from benchmarks.ladder import CALIBRATION, SOURCES, START, TRIAL, ladder
-from benchmarks.machine import make_room, write_csv
+from benchmarks.machine import make_room, timed, write_csv
 from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report
 from benchmarks.speed_accuracy_chart import chart
 from etid.simulation.scenes import Scene
@@ -126,8 +125,8 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[R
             return etid.identify_skin(record, driver, method=method, throw=False)
 
         if not times:
-            times.append(_timed(identify)[0])  # it compiles
-        seconds, fit = _timed(identify)
+            times.append(timed(identify)[1])  # it compiles
+        fit, seconds = timed(identify)
         times.append(seconds)
         said = fit.circuit.values(), fit.stderr.values()
         answers.append(draws.answer(name, seed, fit.verdict, *said))
@@ -143,16 +142,10 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[R
         count = max(1, min(BATCH, round(budget / 3 / seconds)))
         batch = [usable[i % len(usable)][0] for i in range(count)]
         several = [
-            _timed(lambda: etid.identify_skins(batch, known, method=method))[0] for _ in range(3)
+            timed(lambda: etid.identify_skins(batch, known, method=method))[1] for _ in range(3)
         ]
         each = float(np.median(several[1:])) / count
         yield alone._replace(mode="batched", seconds=each, first_seconds=several[0])
-
-
-def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
-    begin = time.perf_counter()
-    found = jax.block_until_ready(call())
-    return time.perf_counter() - begin, found
 
 
 def theirs(draws: Draws, budget: float) -> Iterator[Result]:
