@@ -39,7 +39,7 @@ from benchmarks.charts import INK, new_figure, save
 from benchmarks.control_plant import KINDS, OLDER, Display, Fingertip, by_ngspice, closed_loop
 from benchmarks.ladder import TWO
 from benchmarks.machine import RESULTS, write_csv
-from benchmarks.runner import Target, at_most, option, report
+from benchmarks.runner import Target, at_most, option, report, show
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.state import ElectrodeState, TrackerState
 from etid.plotting.style import BLUE, RED
@@ -110,7 +110,7 @@ def hazards(arguments: argparse.Namespace) -> Iterator[Target]:
         given = found.given(controller, control_hazards.CELLS, arguments.hazard_pulses)
         rows += [control_hazards.row(snr, cell, of) for cell, of in given.items()]
     for row in rows:
-        print("  ".join(f"{name} {value}" for name, value in row.items()), flush=True)
+        show(row)
     write_csv(arguments.output.with_suffix(".csv"), rows)
     names = list(TARGETS)[2:]
     for name, column in zip(names, ("above_otherwise", "above_stated_worst"), strict=True):

@@ -19,7 +19,7 @@ import etid
 from benchmarks import charts, peers
 from benchmarks.machine import median_time, write_csv
 from benchmarks.peers import START, Problem, harmonics, problem, problem_of, terms
-from benchmarks.runner import QUICK, option
+from benchmarks.runner import QUICK, option, show
 from etid.estimators.maximum_likelihood.search import WELL
 
 PINNED = True
@@ -145,11 +145,7 @@ def main(arguments: argparse.Namespace) -> bool:
         itertools.chain(against_samples(SAMPLES[few]), against_lanes(LANES[few]))
     ):
         table.append(row)
-        print(
-            f"{row['against']:<9}{row['what']:<36}{row['number']:>9}{1e3 * row['seconds']:12.4f} ms"
-            f"  slope {row['slope']:.2f}",
-            flush=True,
-        )
+        show(row)
     write_csv(arguments.folder / "curves.csv", table)
     draw(table, arguments.folder / "curves.svg")
     return True

@@ -27,7 +27,7 @@ from benchmarks.failure_axes import MOST, Cell, cells
 from benchmarks.failure_draws import Effort, answers
 from benchmarks.machine import write_csv
 from benchmarks.rates import rate
-from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, tabled
+from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, show, tabled
 
 RATES, SILENT = "failures.csv", "silent_failures.csv"
 MAPS = list(dict.fromkeys(cell.chart for cell in cells()))
@@ -133,21 +133,6 @@ def silent(cell: Cell, every: Sequence[Answer]) -> list[dict[str, Any]]:
     ]
 
 
-def summary(every: Sequence[Answer]) -> Iterator[str]:
-    """One line per method over all cells; and its verdicts."""
-    for name in dict.fromkeys(answer.method for answer in every):
-        of = [answer for answer in every if answer.method == name]
-        r, counts = rates(of), collections.Counter(answer.verdict for answer in of)
-        events = ", ".join(f"{100 * r[event]:.2f} % {event}" for event in EVENTS)
-        yield f"{name}: {r['trials']} trials, {events}"
-        yield "    " + ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
-        yield (
-            f"    silently wrong where determined to 10 %: {100 * r['missed']:.3f} % of "
-            f"{r['determined']}, 95 % interval {100 * r['missed_low']:.3f} to "
-            f"{100 * r['missed_high']:.3f} %"
-        )
-
-
 def targets(rows: Sequence[Mapping[str, Any]], every: Sequence[Answer]) -> Iterator[Target]:
     """Whether the default method fails silently as seldom as it is to."""
     overall, single = TARGETS
@@ -218,7 +203,10 @@ def main(arguments: argparse.Namespace) -> bool:
         of = [row for row in rows if row["map"] == name]
         draw(of, folder / f"failures_{MAPS.index(name) + 1}.svg")
     every = [answer for _, answered in found for answer in answered]
-    print("\n".join(summary(every)))
+    for name in dict.fromkeys(answer.method for answer in every):
+        of = [answer for answer in every if answer.method == name]
+        verdicts = collections.Counter(answer.verdict for answer in of)
+        show({"method": name, **rates(of), **verdicts})
     for row in failures:
         if row["method"] == DEFAULT:
             place = f"{row['map']}, {row['row']}, {row['column']}"

@@ -43,7 +43,7 @@ from benchmarks.ladder import LOADS, recorded
 from benchmarks.machine import make_room
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
 from benchmarks.perturbed_study import Truth, undisturbed
-from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, tabled
+from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, show, tabled
 
 TARGETS = {
     "silent": at_most(0),  # but for what no test can see
@@ -169,20 +169,6 @@ def _worst(silent: Sequence[Answer]) -> dict[str, Any]:
                     strict=True))  # fmt: skip
 
 
-def summary(answers: Sequence[Answer]) -> Iterator[str]:
-    """Lines of a table: one for each perturbation, noise and method."""
-    yield f"{'perturbation':<36}{'SNR':>4}" + "".join(f"{name:>8}" for name in KINDS)
-    for row in table(answers, ("perturbation", "snr_db", "method")):
-        worst = "" if row["method"] == DEFAULT else f"{row['method']}  "
-        if row["silent"]:
-            worst += (
-                f"{row['worst_element']} {row['worst_stderrs']:.1f} standard errors, "
-                f"{100 * row['worst_error']:.1f} %, {row['worst_path']}  "
-            )
-        counts = "".join(f"{row[name]:>8}" for name in KINDS)
-        yield f"{row['perturbation']:<36}{row['snr_db']:>4.0f}{counts}   {worst}{row['verdicts']}"
-
-
 def targets(answers: Sequence[Answer]) -> Iterator[Target]:
     """What the default method misses."""
     of_default = [a for a in answers if a.method == DEFAULT]
@@ -238,5 +224,6 @@ def main(arguments: argparse.Namespace) -> bool:
     answers = ordered(tabled(folder / "perturbations.csv", rows, answers_of, tasks, **settings))
     of_one = [one for one in answers if one.method == methods[0]]
     draw(table(of_one, ("perturbation", "snr_db", "path", "method")), folder / "perturbations.svg")
-    print("\n".join(summary(answers)))
+    for row in table(answers, ("perturbation", "snr_db", "method")):
+        show(row)
     return report(targets(answers))

@@ -117,6 +117,15 @@ def tabled(
     return list(done.values())
 
 
+def show(row: Mapping[str, Any], *names: str) -> None:
+    """Print some columns of a row in a line, or all."""
+    texts = {
+        name: format(row[name], ".4g") if isinstance(row[name], float) else str(row[name])
+        for name in names or row
+    }
+    tqdm.write("  ".join(f"{name} {text}" for name, text in texts.items() if text))
+
+
 Limits = tuple[float, float]  # least and largest value that meet a target; NaN for none
 
 

@@ -28,7 +28,7 @@ import numpy as np
 import etid
 from benchmarks.large_file import LAYOUTS, large_file
 from benchmarks.machine import ROOT, cores, timed, write_csv
-from benchmarks.runner import QUICK, Target, at_least, at_most, option, report
+from benchmarks.runner import QUICK, Target, at_least, at_most, option, report, show
 from etid.estimators.registry import names
 from etid.identify import file as streaming
 
@@ -291,8 +291,7 @@ def main(arguments: argparse.Namespace) -> bool:
         table.append(row)
         alone = next(r for r in table if r["layout"] == row["layout"])  # the first reads by h5py
         row["of_reading"] = row["seconds"] / alone["seconds"]
-        numbers = (f"{name} {of:.4g}" for name, of in row.items() if isinstance(of, float | int))
-        print(f"{row['what']:<26}{row['layout']:<11}", ", ".join(numbers), flush=True)
+        show(row)
     (plan.folder / "fits.h5").unlink(missing_ok=True)
     resumed = resume(plan)
     print(

@@ -9,7 +9,7 @@ apart, on one core. Before everything else rivals have their own environments
 import argparse
 import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from benchmarks import rivals
 from benchmarks.estimators import DEFAULT, ELEMENTS, NOTHING, OURS, Answer, Drivers, method_of
 from benchmarks.ladder import CALIBRATION, SOURCES, START, TRIAL, ladder
 from benchmarks.machine import make_room, timed, write_csv
-from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report
+from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report, show
 from benchmarks.speed_accuracy_chart import chart
 from etid.simulation.scenes import Scene
 
@@ -30,6 +30,10 @@ BUDGET = 6.0  # [s] for one estimator in one scene
 BATCH = 32  # recordings of a timed batch
 PATIENCE = 30  # budgets that a rival may take for all it has begun
 FEWEST = 4  # draws, however long they take
+PRINTED = (
+    *("scene", "estimator", "mode", "draws", "error", "none", "said", "wrong", "silent", "ms"),
+    *("first_s", "driver_ms", "on_front", "missing"),
+)
 SHOWN = ("dry, 80 dB", "dry, 60 dB", "dry, 30 dB", "damp, 60 dB", "damp, 40 dB", "dry, 1 MHz")
 FEW, FEW_REPETITIONS = ("dry, 60 dB", "damp, 40 dB"), 5
 SIGNIFICANT = 2.0  # standard errors of a paired difference
@@ -252,21 +256,6 @@ def ranked(rows: Sequence[dict[str, Any]]) -> Iterator[Target]:
         yield from (target for target in found if not target.met)
 
 
-def _print(rows: Iterable[dict[str, Any]]) -> None:
-    for row in rows:
-        head = f"{row['scene']:<20}{row['estimator']:<31}{row['mode']:<8}"
-        numbers = "".join(
-            f"{unit * row[key]:9.{digits}f} {name}"
-            for key, unit, digits, name in (
-                ("error", 1, 2, "x bound"), ("none", 100, 0, "% none"), ("said", 100, 0, "% said"),
-                ("wrong", 100, 0, "% wrong"), ("silent", 100, 0, "% silent"), ("ms", 1, 2, "ms"),
-                ("first_s", 1, 2, "s first"), ("driver_ms", 1, 0, "ms driver"),
-            )
-        )  # fmt: skip
-        said = row["missing"] or numbers + "  front" * row["on_front"]
-        tqdm.write(f"{head}{row['draws']:>4}{said}")
-
-
 def main(arguments: argparse.Namespace) -> bool:
     """Print and write the table and the charts; whether the ranking of methods holds."""
     quick, folder = arguments.quick, arguments.folder
@@ -274,7 +263,8 @@ def main(arguments: argparse.Namespace) -> bool:
     table: list[dict[str, Any]] = []
     for name in tqdm(arguments.scene or list(FEW if quick else ladder()), unit="scene"):
         rows = rows_of(name, arguments.source, repetitions, quick)
-        _print(rows)
+        for row in rows:
+            show(row, *PRINTED)
         table += rows
         write_csv(folder / FILE, table)  # each scene is kept as it comes
         make_room()
