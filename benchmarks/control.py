@@ -1,25 +1,20 @@
 """Closed loop: the charge at 98 electrodes under a fingertip that changes, and the cap on it.
 
-`benchmarks.control_hazards` counts the pulses above the cap, with loads from a short circuit to
-none and with wrong records. The rest is the charge against ngspice (`benchmarks.control_plant`).
+`benchmarks.control_hazards` counts the pulses above the cap, with any load and with wrong records.
+The rest is the charge against ngspice (`benchmarks.control_plant`): some electrodes stay dry, some
+become wet within 100 ms, some sweat slowly, and one is lifted off and put back. The driver is
+identified from records of ngspice with the same noise and delays.
 
-Some electrodes stay dry, some become wet within 100 ms at different times, some sweat slowly, and
-one is lifted off and put back. The driver is identified from records of ngspice with the same noise
-and delays. Every controller has the same task.
+etid's rivals regulate the terminal voltage to that of a typical dry fingertip; keep an amplitude
+that is calibrated once, at the tenth pulse; integrate the error, A += k (Q* − Q) / q₀ with q₀ of
+typical dry skin (k = 0.25 is stable up to eight times this q₀); or adapt a feed-forward gain to a
+reference model by the normalised MIT rule (Åström and Wittenmark 1995, chapter 5). All of them get
+the true charge Q of the last pulse, as from a perfect sensor.
 
-* etid: `etid.Tracker` and `etid.Controller`.
-* constant voltage: the terminal voltage is regulated to that of a typical dry fingertip.
-* constant amplitude: calibrated once, at the tenth pulse, with the true charge.
-* integral: A += k (Q* − Q) / q₀ with the true charge Q of the last pulse, as from a perfect sensor,
-  and q₀ of typical dry skin; k = 0.25 is stable up to eight times this q₀.
-* model reference: direct model-reference adaptive control with a feed-forward gain and the MIT
-  rule (Åström and Wittenmark 1995, chapter 5), normalised, once per pulse, with the true charge.
-
-The targets count every pulse but those of a change and the two that follow it. An amplitude is
-given before its pulse. Skin that sweats changes its charge by g until then; noise and calibration
-leave a standard error σ of the charge of the last pulse, which comes from the information of the
-tracker. So many pulses as normal errors with mean g and this σ would miss the charge are printed
-beside the number of those that did. They excuse none.
+The targets count every pulse but those of a change and the two that follow it. Skin that sweats
+changes the charge by g after an amplitude is given; noise and calibration leave a standard error σ
+of the charge of the last pulse, by the information of the tracker. So many pulses as normal errors
+with mean g and this σ would miss the charge are printed beside those that did. They excuse none.
 """
 
 import argparse

@@ -1,15 +1,13 @@
 """Recordings as a laboratory makes them: every voltage has its own driver, load, clock and faults.
 
-`etid.scenes` records a study in which all is well. Here each of the two voltages of a recording is
-an `Output` that can be changed alone, and a `Record` can tell its file what is not true. The
-waveforms are the exact periodic ones of `etid.simulation.transformer`:
+Each of the two voltages of a recording is an `Output` that can be changed alone, and a `Record` can
+tell its file what is not true. The waveforms are the exact ones of `etid.simulation.transformer`:
 
     pulses → driver and load → gain → anti-alias filter → sampling → · scale → + added voltages
     + white noise → rounding to a code, clipped at the full scale.
 
 Where the load differs from pulse to pulse, the records of each load are joined between the pulses.
-The voltage is at rest there but for the 2 % of the droop that the transformer has left, of which a
-change of the load by 5 % shows some 0.1 mV of 50 V.
+The voltage is at rest there but for the 2 % of the droop that the transformer has left.
 """
 
 import dataclasses

@@ -42,7 +42,6 @@ OPTIONS = (
     option("--electrodes", default=98),
     option("--minutes", default=10.0),
     option("--windows", default=2, help="readers of the page"),
-    option("--port", default=0, help="of the page, to open it in a browser; 0: any"),
     option("-o", "--output", type=pathlib.Path, default=RESULTS / "live.csv"),
 )
 
@@ -67,12 +66,12 @@ class Timed(LiveView):
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table and write it; whether all targets are met."""
-    tracker, pulses = problem(arguments.electrodes, 0)
+    tracker, pulses = problem(arguments.electrodes)
     controller = etid.Controller.of(tracker)
     period = tracker.period / tracker.model.bands.sample_rate
     number = round(60 * arguments.minutes / period)
     ticks, memory = [], []
-    view = Timed(controller, charge=CHARGE, controls=False, port=arguments.port)
+    view = Timed(controller, charge=CHARGE, controls=False)
     view.taken = []
     with view:
         print(view.address, flush=True)

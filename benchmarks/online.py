@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 import etid
 from benchmarks.machine import RESULTS
-from benchmarks.online_alarms import LIFTED, LOADS, SOON, Fingertip, alarms
+from benchmarks.online_alarms import LOADS, SOON, Fingertip, alarms
 from benchmarks.rivals import RivalError, exchange, make
 from benchmarks.runner import Target, at_least, at_most, option, report
 from etid.online.state import TrackerState
@@ -44,7 +44,6 @@ CHANGE = 1e-3  # random walk that the tracker expects in the ticks [1/√pulse]
 OPTIONS = (
     option("--electrodes", default=98),
     option("--ticks", default=2000),
-    option("--lifted", default=0, help="electrodes that touch nothing"),
     option("--hours", default=4.0, help="electrode hours of false alarms; 0 for none"),
     option("-o", "--output", type=pathlib.Path, default=RESULTS / "online.csv"),
 )
@@ -53,7 +52,7 @@ OPTIONS = (
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table and write it; whether all targets are met."""
     electrodes, hours = arguments.electrodes, arguments.hours
-    found = list(ticks(electrodes, arguments.lifted, arguments.ticks))
+    found = list(ticks(electrodes, arguments.ticks))
     for snr_db in NOISES if hours > 0 else ():
         found += tests(electrodes, snr_db, hours)
     return report(found, arguments.output)
@@ -64,9 +63,9 @@ def named(name: str, value: float, of: str = "") -> Target:
     return Target(f"{of}{name}", value, *TARGETS.get(name, (np.nan, np.nan)))
 
 
-def ticks(electrodes: int, lifted: int, number: int) -> Iterator[Target]:
+def ticks(electrodes: int, number: int) -> Iterator[Target]:
     """Times of a tick, and of filterpy."""
-    tracker, pulses = problem(electrodes, lifted)
+    tracker, pulses = problem(electrodes)
     state, ratios, busy = timed(tracker, pulses, number)
     print(f"{electrodes} electrodes, {len(ratios)} ticks: {tracker.read(state).counts()}")
     for name, percent in (("median", 50), ("p99", 99), ("worst", 100)):
@@ -114,10 +113,9 @@ def timed(
     return state, wall, busy
 
 
-def problem(electrodes: int, lifted: int) -> tuple[etid.Tracker, np.ndarray]:
+def problem(electrodes: int) -> tuple[etid.Tracker, np.ndarray]:
     """A tracker, and pulses for it (pulse, electrode, sample)."""
     display, loads = Fingertip(electrodes, NOISES[0], CHANGE), np.arange(electrodes) % len(LOADS)
-    loads[:lifted] = LIFTED
     return display.tracker, np.stack([*display.pulses(loads, KINDS)])
 
 

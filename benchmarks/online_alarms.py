@@ -19,10 +19,8 @@ import etid
 from benchmarks.ladder import TWO
 from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import OpenLoad
 
 LOADS = tuple(TYPICAL.values())
-LIFTED = len(LOADS)  # number of the load of an electrode that touches nothing
 JITTER = 50e-9  # [s]
 UNLOADED = 40_000  # samples of the unloaded record: twelve periods
 LOADED = 10_000  # samples of the simulated windows: three, one of each sampling phase
@@ -62,14 +60,15 @@ class Fingertip:
             driver, calibrations[0], electrodes=electrodes, change=change
         )
         self.sigma = noisy.waveform().sigma
-        every = enumerate((*LOADS, OpenLoad()))
-        trials = [Trial(f"{at}/{draw}", load) for at, load in every for draw in range(DRAWS)]
+        trials = [
+            Trial(f"{at}/{draw}", load) for at, load in enumerate(LOADS) for draw in range(DRAWS)
+        ]
         exact = dataclasses.replace(
             noisy, trials=tuple(trials), calibration=(), samples=LOADED, snr_db=None, bits=None
         ).simulate(seed=1)
         records = np.stack([one.v_out for one in exact.recordings()])
         windows = self.tracker.pulses(records)
-        self.windows = windows.reshape(len(windows), len(LOADS) + 1, DRAWS, -1)
+        self.windows = windows.reshape(len(windows), len(LOADS), DRAWS, -1)
         self.rng = np.random.default_rng([2, round(snr_db)])
 
     def pulse(self, number: int, loads: np.ndarray) -> Float[np.ndarray, "lane sample"]:

@@ -32,7 +32,6 @@ from benchmarks.estimators import (
     ELEMENTS,
     FAR,
     OFF,
-    OURS,
     Answer,
     Drivers,
     fits,
@@ -59,7 +58,6 @@ OPTIONS = (
     option("--only", nargs="+", choices=PERTURBATIONS, metavar="NAME", help="these perturbations"),
     option("--drivers", default=10),
     option("--snr-db", default=(40.0, 60.0), metavar="DB"),
-    option("--method", default=(DEFAULT,), choices=OURS),
 )
 
 
@@ -105,29 +103,25 @@ def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[s
     return {path: np.array(list(of.relative.values())) for path, of in etid.bound(scene).items()}
 
 
-def answers_of(
-    names: Sequence[str], number: int, snr_db: float, methods: Sequence[str]
-) -> list[Answer]:
+def answers_of(names: Sequence[str], number: int, snr_db: float) -> list[Answer]:
     """All answers behind one driver with one noise; perturbations that share a driver together."""
     with jax.enable_x64(True):  # of a worker process
         drivers, found = Drivers(), list[Answer]()
-        studies = {name: PERTURBATIONS[name](undisturbed(number, snr_db)) for name in names}
-        calibrations = {n: [of.recording(number) for of in s.calibrations]
-                        for n, s in studies.items()}  # fmt: skip
-        together: dict[tuple, list[tuple[str, Record, Truth]]] = {}
-        behind = [(method, name) for method in methods for name in names]
-        known = {place: drivers.of(calibrations[place[1]], place[0]) for place in behind}
-        for method, name in behind:
-            trials = [(name, of, studies[name].truths[of.path]) for of in studies[name].trials]
-            together.setdefault((method, id(known[method, name])), []).extend(trials)
-        for (method, _), trials in together.items():
-            driver = known[method, trials[0][0]]
-            records = [of.recording(number) for _, of, _ in trials]
-            for (name, of, truth), fit in zip(trials, fits(records, driver, method), strict=True):
+        together: dict[int, list[tuple[str, Record, Truth]]] = {}
+        behind: dict[int, etid.Driver | None] = {}
+        for name in names:
+            study = PERTURBATIONS[name](undisturbed(number, snr_db))
+            driver = drivers.of([of.recording(number) for of in study.calibrations], DEFAULT)
+            behind[id(driver)] = driver
+            trials = [(name, of, study.truths[of.path]) for of in study.trials]
+            together.setdefault(id(driver), []).extend(trials)
+        for key, trials in together.items():
+            every = fits([of.recording(number) for _, of, _ in trials], behind[key], DEFAULT)
+            for (name, of, truth), fit in zip(trials, every, strict=True):
                 values, stderr, verdict = found_by(fit)
                 found.append(
                     Answer(
-                        *(method, number, of.path, verdict),
+                        *(DEFAULT, number, of.path, verdict),
                         error=error_of(values, truth, fit is not None and int(fit.remarks) != 0),
                         stderr=stderr / ((truth.low + truth.high) / 2),
                         bound=_bounds(snr_db, of.samples, of.bits, of.full_scale)[of.path],
@@ -171,15 +165,14 @@ def _worst(silent: Sequence[Answer]) -> dict[str, Any]:
 
 def targets(answers: Sequence[Answer]) -> Iterator[Target]:
     """What the default method misses."""
-    of_default = [a for a in answers if a.method == DEFAULT]
     silent, refused = TARGETS
-    for row in table(of_default, ("perturbation", "snr_db", "path")):
+    for row in table(answers, ("perturbation", "snr_db", "path")):
         name, place, count = row["perturbation"], (row["path"], row["snr_db"]), row[silent]
         known = INVISIBLE.get(name)
         if count and not (known and known.excuses(*place, count, row["answers"])):
             where = f"{silent}: {name}, {place[0]} at {place[1]:g} dB"
             yield Target(where, count, *TARGETS[silent], f"{count} of {row['answers']}")
-    for row in table(of_default, ("perturbation",)):
+    for row in table(answers, ("perturbation",)):
         if row["perturbation"] in UNDISTURBED:
             share = (row["refused"] + row["said"]) / row["answers"]
             yield Target(f"{refused}: {row['perturbation']}", share, *TARGETS[refused])
@@ -204,26 +197,23 @@ def _label(name: str) -> str:
 
 def main(arguments: argparse.Namespace) -> bool:
     """Draw, count and print; write the table with every driver that is done, and the picture."""
-    quick, methods, folder = arguments.quick, arguments.method, arguments.folder
+    quick, folder = arguments.quick, arguments.folder
     names = list(FEW) if quick else arguments.only or list(PERTURBATIONS)
     numbers = range(2 if quick else arguments.drivers)
-    tasks = [(names, number, snr, methods) for number in numbers for snr in arguments.snr_db]
-    place = {name: number for number, name in enumerate(names)}
+    tasks = [(names, number, snr) for number in numbers for snr in arguments.snr_db]
 
     def ordered(done: Iterable[Sequence[Answer]]) -> list[Answer]:
-        every = [answer for found in done for answer in found]
-        return sorted(
-            every, key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.method, a.seed)
-        )
+        every = (answer for found in done for answer in found)
+        place = {name: number for number, name in enumerate(names)}
+        return sorted(every, key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.seed))
 
     def rows(done: Mapping[int, Sequence[Answer]]) -> list[dict[str, Any]]:
         return table(ordered(done.values()), ("perturbation", "snr_db", "path", "method"))
 
     workers = 1 if quick else arguments.workers
     settings = {"workers": workers, "unit": "driver", "keep": "perturbations"}
-    answers = ordered(tabled(folder / "perturbations.csv", rows, answers_of, tasks, **settings))
-    of_one = [one for one in answers if one.method == methods[0]]
-    draw(table(of_one, ("perturbation", "snr_db", "path", "method")), folder / "perturbations.svg")
-    for row in table(answers, ("perturbation", "snr_db", "method")):
+    found = tabled(folder / "perturbations.csv", rows, answers_of, tasks, **settings)
+    draw(rows(dict(enumerate(found))), folder / "perturbations.svg")
+    for row in table(ordered(found), ("perturbation", "snr_db")):
         show(row)
-    return report(targets(answers))
+    return report(targets(ordered(found)))

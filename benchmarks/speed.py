@@ -109,7 +109,7 @@ def fits(of: Problem, repeats: int) -> Iterator[Target]:
 
 def tick(electrodes: int, ticks: int) -> Target:
     """A tick on-line with its tests and the next command, against the time between two pulses."""
-    tracker, pulses = online.problem(electrodes, 0)
+    tracker, pulses = online.problem(electrodes)
     period = tracker.period / tracker.model.bands.sample_rate
     ratio = float(np.percentile(online.timed(tracker, pulses, ticks)[1], 99))
     name = f"tick of {electrodes} electrodes, p99 / period"

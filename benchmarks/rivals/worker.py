@@ -1,12 +1,10 @@
 """Runs one rival: `python -m benchmarks.rivals.worker PROBLEM RESULT`.
 
-PROBLEM holds `name`, a module beside this one, run by the Python of its own environment. It has
-`skin` for one record and Z_th as measured, or `fit` for the residuals of `harmonic_fit`, or `batch`
-of an estimator for all of a problem at once. Besides: `v_th`,
-`v_out`, `ref_th`, `ref_out` (draw, sample) [V], `r_ref` (draw,) [ohm], `start` (3,) in SI, `fs`,
-`f0` [Hz], `repeats`, and `budget` [s], after which no further draw is begun, but for the second; a
-first fit that took as long is the only one. RESULT gets the fields of `rivals.Outcome`, `versions`
-and `errors` as JSON.
+PROBLEM is that of `rivals.run`; its `name` is a module beside this, run by the Python of its own
+environment, which has `skin` for one record and Z_th as measured, or `fit` for the residuals of
+`harmonic_fit`, or `batch` of an estimator for all of a problem at once. After the `budget` [s] no
+further draw is begun, but for the second; a first fit that took as long is the only one. RESULT
+gets the fields of `rivals.Outcome`, `versions` and `errors` as JSON.
 """
 
 import functools
