@@ -6,6 +6,7 @@ and trials with dry and damp skin by turns, which share the driver identified fr
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -208,13 +209,8 @@ def _level(ratio: float, skin: SkinLoad) -> SkinLoad:
 
 def transformer(order: int) -> TransformerDriver:
     """The driver with as many poles, 2 to 6."""
-    lost = {
-        name: value
-        for poles, part in LOST.items()
-        if poles >= order
-        for name, value in part.items()
-    }
-    return TransformerDriver(**lost)
+    lost = [part for poles, part in LOST.items() if poles >= order]
+    return TransformerDriver(**functools.reduce(operator.or_, lost))
 
 
 def cells() -> Iterator[Cell]:

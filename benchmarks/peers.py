@@ -72,12 +72,6 @@ class Problem(NamedTuple):
     lanes: Harmonics  # their harmonics, stacked
     known: GivenDriver  # what the calibration tells at these
 
-    def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Both voltages of all trials, stacked."""
-        voltages = [(record.v_th, record.v_out) for record in self.records]
-        v_th, v_out = (np.stack(column) for column in zip(*voltages, strict=True))
-        return v_th, v_out
-
     def load(self, one: Any) -> Load:
         """A lane with Z_th as it is; calling it gives the terms of elements and delay."""
         rate = jnp.asarray(one.sample_rate)
