@@ -26,11 +26,9 @@ import etid
 from benchmarks import charts
 from benchmarks.ladder import SOURCES
 from benchmarks.machine import write_csv
-from benchmarks.runner import QUICK, Target, at_most, option, report
-from etid.circuits.display import DISPLAY
+from benchmarks.runner import QUICK, Target, at_most, option, report, show
 from etid.paper.tables import LABORATORIES as ENDS
 from etid.paper.tables import METHODS, ORDER, Outcome, Truth, errors, identify, resistor_errors
-from etid.report.html import Section, Table, number
 from etid.simulation import published
 from etid.simulation.scenes import Scene
 
@@ -52,21 +50,6 @@ TARGETS = {
     "Table I at 60 dB, largest rms error of a resistor [%]": at_most(0.1),
     "Table IV at 30 dB, error of the mean in standard errors": at_most(2.0),
 }
-TABLES = (
-    (
-        "Table I: errors of five resistors [%]",
-        "Mean over the studies, and standard deviation between them.",
-        ("r", "paper_error", "error", "spread", "circuits", "fits"),
-    ),
-    (
-        "Table IV: the built circuit",
-        "Mean error and scatter between the trials of a study [%], and standard deviation between "
-        "the means of the studies, each with its own calibration. The paper tells no sign.",
-        ("element", "paper_error", "paper_scatter", "error", "scatter", "between", "rrse",
-         "circuits", "successful", "fits"),
-    ),
-)  # fmt: skip
-
 OPTIONS = (
     QUICK,
     option("--source", default="simulated", choices=SOURCES),
@@ -148,19 +131,6 @@ def _stderr_of_mean(fits: etid.Fits, truth: Truth, i: int) -> float:
     return float(100 / known * np.sqrt(shared + (total - shared) / len(fits)))
 
 
-def show(rows: Sequence[Row], columns: Sequence[str]) -> Table:
-    """A table for the terminal; resistances in the unit in which circuits are printed."""
-    scale, symbol = DISPLAY["ohm"]
-
-    def cell(name: str, value: Any) -> str:
-        if not isinstance(value, float):
-            return str(value)
-        return f"{value / scale:.4g} {symbol}" if name == "r" else number(value)
-
-    heads = ("laboratory", "method", *columns)
-    return Table(heads, tuple(tuple(cell(name, row[name]) for name in heads) for row in rows))
-
-
 def targets(first: Sequence[Row], fourth: Sequence[Row]) -> Iterator[Target]:
     """Whether the default method is as right as it is to be."""
     resistors, mean = TARGETS
@@ -234,9 +204,10 @@ def main(arguments: argparse.Namespace) -> bool:
         for method in METHODS:
             groups.setdefault((laboratory, method), []).append(identify(laboratory, study, method))
     first, fourth = table_1(groups), table_4(groups, truth)
-    for (title, text, columns), which, rows in zip(TABLES, (1, 4), (first, fourth), strict=True):
+    for which, rows in (1, first), (4, fourth):
         write_csv(folder / f"table_{which}.csv", [{"source": source, **row} for row in rows])
-        print(f"\n{Section(title, text, (show(rows, columns),))}")
+        for row in rows:
+            show({"table": which, **row})
     print(f"\n{textwrap.fill(cause(fourth), 100)}\n")
     draw(fourth, folder / "table_4.svg")
     print(f"Tables and figure: {folder.resolve()}")

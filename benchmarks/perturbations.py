@@ -25,18 +25,8 @@ import jax
 import numpy as np
 
 import etid
-from benchmarks import charts
-from benchmarks.estimators import (
-    DEFAULT,
-    DETERMINED,
-    ELEMENTS,
-    FAR,
-    OFF,
-    Answer,
-    Drivers,
-    fits,
-    found_by,
-)
+from benchmarks import charts, estimators
+from benchmarks.estimators import DEFAULT, ELEMENTS, FAR, Answer, Drivers, fits, found_by
 from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS, recorded
 from benchmarks.machine import make_room
@@ -74,7 +64,7 @@ def in_stderrs(of: Answer) -> np.ndarray:
 def kind(of: Answer) -> str:
     """What an answer is, of `KINDS`."""
     far = (in_stderrs(of) > FAR) & of.exact
-    far |= (np.abs(of.error) > OFF) & (of.bound <= DETERMINED)
+    far |= (np.abs(of.error) > estimators.OFF) & (of.bound <= estimators.DETERMINED)
     wrong = bool(far.any() or np.isnan(of.error).any())
     if of.successful:
         return "silent" if wrong else "right"

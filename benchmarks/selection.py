@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import etid
-from benchmarks import charts, selection_rival
+from benchmarks import charts, runner, selection_rival
 from benchmarks import selection_counts as counts
 from benchmarks.estimators import Answer
 from benchmarks.failure_axes import Cell
@@ -26,18 +26,7 @@ from benchmarks.failure_draws import AUTO, Effort, answers
 from benchmarks.machine import median_time, timed, write_csv
 from benchmarks.perturbed_study import DELAY
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
-from benchmarks.runner import (
-    FOLDER,
-    QUICK,
-    WORKERS,
-    Target,
-    at_least,
-    at_most,
-    each,
-    option,
-    report,
-    tabled,
-)
+from benchmarks.runner import Target, at_least, at_most, each, option, report, tabled
 from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
 from etid.selection.search import USUAL
 from etid.simulation import scenes
@@ -50,7 +39,10 @@ BATCH, SINGLES = 64, 16  # recordings of a pair: at once, and one at a time
 FEW, FEW_PAIRS, FEW_DRIVERS, FEW_SNR, STEP = Effort(1, 4), 3, 2, (20, 60), 20
 RIVAL_DRIVERS, RIVAL_SNR = 1, (20, 40, 60)  # ten seconds for each recording
 
-OPTIONS = (QUICK, WORKERS, FOLDER, option("--drivers", default=25, help="of an SNR"))
+OPTIONS = (
+    *(runner.QUICK, runner.WORKERS, runner.FOLDER),
+    option("--drivers", default=25, help="of an SNR"),
+)
 TARGETS = {
     "right circuit where decisive, from 30 dB": at_least(0.99),
     "spurious element, from 20 dB": at_most(0.005),

@@ -103,8 +103,9 @@ def exact(circuit: etid.AbstractCircuit) -> dict[str, tuple[float, float]]:
 
 def good(rng: np.random.Generator, points: int = POINTS) -> Spectrum:
     """A spectrum without a fault, and its circuit."""
-    circuit = (one_rc, one_rc, spread, layers)[kind := rng.integers(4)](rng)
-    if kind == 1:  # skin without R_s
+    kind = rng.integers(4)
+    circuit = (one_rc, one_rc, spread, layers)[kind](rng)
+    if kind == 1 and isinstance(circuit, etid.SkinRC):  # skin without R_s
         circuit = etid.ParallelRC(circuit.r_p, circuit.c_p)
     f = frequencies(rng, points)
     return Spectrum(f, noisy(response(circuit, f), rng), type(circuit)(), exact(circuit))

@@ -189,15 +189,6 @@ def test_fits_without_a_circuit_are_counted_and_left_out(outcome):
         assert row["error"] == pytest.approx(10.0)
 
 
-def test_tables_by_cause_print_numbers_beside_those_of_the_paper(groups):
-    truth = etid.scenes.paper().truth()
-    first, fourth = (columns for *_, columns in paper.TABLES)
-    table = paper.show(paper.table_1(groups), first)
-    assert table.rows[0] == ("good", "output_error", "21.62 kΩ", "4.26", "20.00", "14.14", "2", "2")
-    table = paper.show(paper.table_4(groups, truth), fourth)
-    assert table.rows[0][2:8] == ("r_p", "2.46", "17.50", "20.00", "0.00", "14.14")
-
-
 def test_each_cause_is_one_change_of_the_good_laboratory():
     good, both = paper.LABORATORIES["good"], paper.LABORATORIES["both"]
     default = {"trigger_jitter_rms": 0.0, **good}
