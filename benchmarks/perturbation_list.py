@@ -175,7 +175,7 @@ DRIVERS: Mapping[str, Change] = {
 CALIBRATIONS: Mapping[str, Change] = {
     "driver_Rload_wrong_5%": calibrations(out(loads=(ResistorLoad(1.05 * lab.REFERENCE),))),
     "two_resistors_one_wrong_5%": lab.second_resistor(1.05),
-    "says_98.8ohm": calibrations(lab.record(told={"r_load": REFERENCE / 1000})),
+    "says_98.8ohm": calibrations(lab.record(told={"r_load": lab.REFERENCE / 1000})),
     "says_1mohm": calibrations(lab.record(told={"r_load": 1e-3})),
     "says_1Tohm": calibrations(lab.record(told={"r_load": 1e12})),
     "calibration_v_out_is_v_th": calibrations(lab.record(copied=True)),
