@@ -188,16 +188,14 @@ def by_balance(case: Case, truth: np.ndarray, finer: int) -> Line:
     return Line(f"harmonic balance, {finer} points per sample", error, alone, with_slopes, first)
 
 
-def by_diffrax(
-    case: Case, truth: np.ndarray, settings: tuple[tuple[str, float], ...] = SETTINGS
-) -> list[Line]:
+def by_diffrax(case: Case, truth: np.ndarray) -> list[Line]:
     """The same by diffrax with each setting, timed in a process of its own."""
     given: dict[str, Any] = {
         "logs": np.asarray(case.skin.log_values()),
         "t": case.t,
         "period": 1 / PULSE_RATE,
-        "methods": [method for method, _ in settings],
-        "tolerances": [tolerance for _, tolerance in settings],
+        "methods": [method for method, _ in SETTINGS],
+        "tolerances": [tolerance for _, tolerance in SETTINGS],
     }
     if case.v_th is None:  # at rest before the pulse
         given |= {"periods": 1, "height": HEIGHT, "edges": EDGES, "width": WIDTH}
@@ -208,7 +206,7 @@ def by_diffrax(
     return [
         Line(f"diffrax, {method}, {tolerance:g}", _error(voltage, truth), *map(float, times))
         for (method, tolerance), voltage, *times in zip(
-            settings,
+            SETTINGS,
             *(found[name] for name in ("voltage", "seconds", "slopes", "first")),
             strict=True,
         )

@@ -187,15 +187,6 @@ def rivals(display: Display) -> dict[str, Command]:
     held = display.mean[0] * nominal
     gain, model = np.asarray(nominal / WANTED), 0.0
 
-    def voltage(_: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return amplitude * held / v
-
-    def constant(pulse: int, amplitude: np.ndarray, charge: np.ndarray, _: Any) -> np.ndarray:
-        return amplitude * WANTED / charge if pulse == 9 else amplitude
-
-    def integral(_: int, amplitude: np.ndarray, charge: np.ndarray, v: Any) -> np.ndarray:
-        return np.maximum(amplitude + GAIN * (WANTED - charge) / typical, 0.0)
-
     def adaptive(_: int, amplitude: np.ndarray, charge: np.ndarray, v: Any) -> np.ndarray:
         nonlocal gain, model
         model = REFERENCE_POLE * model + (1 - REFERENCE_POLE) * WANTED
@@ -204,9 +195,13 @@ def rivals(display: Display) -> dict[str, Command]:
         return gain * WANTED
 
     return {
-        "constant voltage": voltage,
-        "constant amplitude": constant,
-        "integral": integral,
+        "constant voltage": lambda _, amplitude, charge, v: amplitude * held / v,
+        "constant amplitude": lambda pulse, amplitude, charge, _: (
+            amplitude * WANTED / charge if pulse == 9 else amplitude
+        ),
+        "integral": lambda _, amplitude, charge, v: np.maximum(
+            amplitude + GAIN * (WANTED - charge) / typical, 0.0
+        ),
         "model reference": adaptive,
     }
 

@@ -25,17 +25,13 @@ from benchmarks.rivals.roster import RIVALS
 FEWEST = 2  # draws
 
 
-def methods(rival):
-    """What identifies a driver and a skin by a rival."""
-    if hasattr(rival, "fit"):
-        each = harmonic_fit.driver, harmonic_fit.skin
-        return [functools.partial(one, rival.fit) for one in each]
-    return measured_driver, rival.skin
-
-
 def results(rival, problem, repeats, budget):
     """All draws, one after the other; what fails costs its own draw alone."""
-    driver, skin = methods(rival)
+    if hasattr(rival, "fit"):
+        driver = functools.partial(harmonic_fit.driver, rival.fit)
+        skin = functools.partial(harmonic_fit.skin, rival.fit)
+    else:
+        driver, skin = measured_driver, rival.skin
     fs, f0, start = float(problem["fs"]), float(problem["f0"]), problem["start"]
     draws = len(problem["r_ref"])
     found = {
