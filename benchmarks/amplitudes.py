@@ -8,6 +8,7 @@ environment of its own (`.rivals`).
 """
 
 import argparse
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import erf
 
 import etid
+from benchmarks.machine import timed
 from benchmarks.rivals import exchange, make
 from benchmarks.runner import Target, at_most, option, report
 from etid.circuits.current_dependent import Norton, Signals, port
@@ -176,31 +178,24 @@ def by_balance(case: Case, truth: np.ndarray, finer: int) -> Line:
     """Harmonic balance, timed."""
     logs, function = case.skin.log_values(), jax.jit(balanced(case, finer))
     first, seconds = 0.0, list[float]()
-    for call in (function, jax.jit(jax.jacfwd(function))):
-        begin = time.perf_counter()
-        jax.block_until_ready(call(logs))
-        first += time.perf_counter() - begin
-        runs = []
-        for _ in range(REPEATS):
-            begin = time.process_time()
-            jax.block_until_ready(call(logs))
-            runs.append(time.process_time() - begin)
+    for of in (function, jax.jit(jax.jacfwd(function))):
+        call = functools.partial(of, logs)
+        first += timed(call)[1]
+        runs = [timed(call, time.process_time)[1] for _ in range(REPEATS)]
         seconds.append(float(np.median(runs)))
     error = _error(np.asarray(function(logs)), truth)
     alone, with_slopes = seconds
     return Line(f"harmonic balance, {finer} points per sample", error, alone, with_slopes, first)
 
 
-def by_diffrax(
-    case: Case, truth: np.ndarray, settings: tuple[tuple[str, float], ...] = SETTINGS
-) -> list[Line]:
+def by_diffrax(case: Case, truth: np.ndarray) -> list[Line]:
     """The same by diffrax with each setting, timed in a process of its own."""
     given: dict[str, Any] = {
         "logs": np.asarray(case.skin.log_values()),
         "t": case.t,
         "period": 1 / PULSE_RATE,
-        "methods": [method for method, _ in settings],
-        "tolerances": [tolerance for _, tolerance in settings],
+        "methods": [method for method, _ in SETTINGS],
+        "tolerances": [tolerance for _, tolerance in SETTINGS],
     }
     if case.v_th is None:  # at rest before the pulse
         given |= {"periods": 1, "height": HEIGHT, "edges": EDGES, "width": WIDTH}
@@ -211,7 +206,7 @@ def by_diffrax(
     return [
         Line(f"diffrax, {method}, {tolerance:g}", _error(voltage, truth), *map(float, times))
         for (method, tolerance), voltage, *times in zip(
-            settings,
+            SETTINGS,
             *(found[name] for name in ("voltage", "seconds", "slopes", "first")),
             strict=True,
         )

@@ -34,12 +34,8 @@ def save(figure: Figure, path: pathlib.Path) -> None:
         figure.savefig(path, metadata={"Date": None, "Description": source})
 
 
-Counts = Mapping[str, Mapping[str, int]]
-"""Counts of each kind by row of a panel."""
-
-
 def shares(
-    panels: Mapping[str, Counts],
+    panels: Mapping[str, Mapping[str, Mapping[str, float]]],
     faces: Mapping[str, tuple[str, str, str]],
     path: pathlib.Path,
     *,
@@ -48,13 +44,9 @@ def shares(
 ) -> None:
     """Draw bars of the shares of each kind: a bar for each row, a panel for each column.
 
-    Args:
-        panels: The counts, by title of the panel.
-        faces: Colour, hatch and label of each kind, in the order of the bars: hatches tell them
-            apart in black and white.
-        path: SVG or PNG to write.
-        title: Of the figure.
-        texts: What is written beside a bar, by panel and row.
+    `panels` has the counts of each kind by panel and row. `faces` has colour, hatch and label of
+    each kind, in the order of the bars; hatches tell them apart in black and white. `texts` stand
+    beside a bar, by panel and row.
     """
     rows = list(dict.fromkeys(row for of in panels.values() for row in of))
     size = 2.6 + PANEL * len(panels), 1.4 + LINE * len(rows)

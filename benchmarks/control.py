@@ -1,30 +1,20 @@
 """Closed loop: the charge at 98 electrodes under a fingertip that changes, and the cap on it.
 
-`benchmarks.control_hazards` counts the pulses above the cap, with loads from a short circuit to
-none and with wrong records. The rest is the charge against ngspice.
+`benchmarks.control_hazards` counts the pulses above the cap, with any load and with wrong records.
+The rest is the charge against ngspice (`benchmarks.control_plant`): some electrodes stay dry, some
+become wet within 100 ms, some sweat slowly, and one is lifted off and put back. The driver is
+identified from records of ngspice with the same noise and delays.
 
-The plant is `benchmarks.control_plant`. Some electrodes stay dry, some become wet within 100 ms at
-different times, some sweat slowly, and one is lifted off and put back. The driver is identified
-from records of ngspice with the same noise and delays. Every controller has the same task.
+etid's rivals regulate the terminal voltage to that of a typical dry fingertip; keep an amplitude
+that is calibrated once, at the tenth pulse; integrate the error, A += k (Q* − Q) / q₀ with q₀ of
+typical dry skin (k = 0.25 is stable up to eight times this q₀); or adapt a feed-forward gain to a
+reference model by the normalised MIT rule (Åström and Wittenmark 1995, chapter 5). All of them get
+the true charge Q of the last pulse, as from a perfect sensor.
 
-* etid: `etid.Tracker` and `etid.Controller`.
-* constant voltage: the terminal voltage is regulated to that of a typical dry fingertip.
-* constant amplitude: calibrated once, at the tenth pulse, with the true charge.
-* integral: A += k (Q* − Q) / q₀ with the true charge Q of the last pulse, as from a perfect sensor,
-  and q₀ of typical dry skin; k = 0.25 is stable up to eight times this q₀.
-* model reference: direct model-reference adaptive control with a feed-forward gain and the MIT
-  rule (Åström and Wittenmark 1995, chapter 5), normalised, once per pulse, with the true charge. Of
-  Shen, Gregory and Xi (2014) only the abstract was available: a direct model-reference adaptive
-  controller whose current follows a pulsed reference. Their controller acts within the pulse.
-
-The targets are those of `TARGETS`. They count every pulse but those of a change and the two that
-follow it.
-
-**What noise explains.** An amplitude is given before its pulse. Skin that sweats changes its charge
-by g until then; noise and calibration leave a standard error σ of the charge of the last pulse. So
-many pulses as normal errors with mean g and this σ would miss the charge are printed beside the
-number of those that did. They excuse none. σ comes from the information of the tracker;
-`tests/test_online.py` compares it with the scatter of errors.
+The targets count every pulse but those of a change and the two that follow it. Skin that sweats
+changes the charge by g after an amplitude is given; noise and calibration leave a standard error σ
+of the charge of the last pulse, by the information of the tracker. So many pulses as normal errors
+with mean g and this σ would miss the charge are printed beside those that did. They excuse none.
 """
 
 import argparse
@@ -44,7 +34,7 @@ from benchmarks.charts import INK, new_figure, save
 from benchmarks.control_plant import KINDS, OLDER, Display, Fingertip, by_ngspice, closed_loop
 from benchmarks.ladder import TWO
 from benchmarks.machine import RESULTS, write_csv
-from benchmarks.runner import Target, at_most, option, report
+from benchmarks.runner import Target, at_most, option, report, show
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.state import ElectrodeState, TrackerState
 from etid.plotting.style import BLUE, RED
@@ -75,8 +65,6 @@ STYLES = {
 NOISIER = "#f39c12"  # of etid with more noise
 
 Command = Callable[[int, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-
-
 OPTIONS = (
     option("--electrodes", default=98),
     option("--pulses", default=120),
@@ -117,7 +105,7 @@ def hazards(arguments: argparse.Namespace) -> Iterator[Target]:
         given = found.given(controller, control_hazards.CELLS, arguments.hazard_pulses)
         rows += [control_hazards.row(snr, cell, of) for cell, of in given.items()]
     for row in rows:
-        print("  ".join(f"{name} {value}" for name, value in row.items()), flush=True)
+        show(row)
     write_csv(arguments.output.with_suffix(".csv"), rows)
     names = list(TARGETS)[2:]
     for name, column in zip(names, ("above_otherwise", "above_stated_worst"), strict=True):
@@ -199,15 +187,6 @@ def rivals(display: Display) -> dict[str, Command]:
     held = display.mean[0] * nominal
     gain, model = np.asarray(nominal / WANTED), 0.0
 
-    def voltage(_: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return amplitude * held / v
-
-    def constant(pulse: int, amplitude: np.ndarray, charge: np.ndarray, _: Any) -> np.ndarray:
-        return amplitude * WANTED / charge if pulse == 9 else amplitude
-
-    def integral(_: int, amplitude: np.ndarray, charge: np.ndarray, v: Any) -> np.ndarray:
-        return np.maximum(amplitude + GAIN * (WANTED - charge) / typical, 0.0)
-
     def adaptive(_: int, amplitude: np.ndarray, charge: np.ndarray, v: Any) -> np.ndarray:
         nonlocal gain, model
         model = REFERENCE_POLE * model + (1 - REFERENCE_POLE) * WANTED
@@ -216,9 +195,13 @@ def rivals(display: Display) -> dict[str, Command]:
         return gain * WANTED
 
     return {
-        "constant voltage": voltage,
-        "constant amplitude": constant,
-        "integral": integral,
+        "constant voltage": lambda _, amplitude, charge, v: amplitude * held / v,
+        "constant amplitude": lambda pulse, amplitude, charge, _: (
+            amplitude * WANTED / charge if pulse == 9 else amplitude
+        ),
+        "integral": lambda _, amplitude, charge, v: np.maximum(
+            amplitude + GAIN * (WANTED - charge) / typical, 0.0
+        ),
         "model reference": adaptive,
     }
 
@@ -240,8 +223,7 @@ def missing(
     mean: Float[np.ndarray, " lane"], sigma: Float[Array, " lane"]
 ) -> Float[np.ndarray, " lane"]:
     """Probability that a normal error misses the target; 0 where there is no estimate."""
-    width = np.asarray(sigma)
-    tails = (-NEAR - mean) / width, (mean - NEAR) / width
+    tails = (-NEAR - mean) / np.asarray(sigma), (mean - NEAR) / np.asarray(sigma)
     return np.nan_to_num(sum(scipy.special.ndtr(tail) for tail in tails))
 
 

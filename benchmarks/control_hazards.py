@@ -1,15 +1,13 @@
 """The cap on the charge under hazards: loads from a short circuit to none, and wrong records.
 
-The plant is `benchmarks.control_plant`. In every cell the loads change at random, between a
-short circuit, resistors, skin of all kinds, and no contact. In most cells the records are wrong as
-well, each for some pulses.
+The loads change at random, between a short circuit, resistors, skin of all kinds, and no contact
+(`benchmarks.control_plant`). In most cells the records are wrong as well, each for some pulses.
 
 A pulse is **above the cap** if its charge exceeds the cap. It follows an **unseen change** if the
 load changed just before it, and the load before would have had no more than the cap: no record
 could show the change. Behind two swapped channels, the electrode's own channel shows the change one
-pulse later, so that there are two such pulses.
-
-The target is no other pulse above the cap, and none above the worst case that the command states.
+pulse later, so that there are two such pulses. The target is no other pulse above the cap, and none
+above the worst case that the command states.
 """
 
 import dataclasses
@@ -96,14 +94,7 @@ class Cell:
         amplitude: Float[np.ndarray, "older lane"],
         adc_range: Float[np.ndarray, " 2"],
     ) -> tuple[Float[np.ndarray, "lane sample"], Float[np.ndarray, " lane"]]:
-        """Windows and amplitudes that the tracker gets.
-
-        Args:
-            number: Number of the pulse.
-            v: Windows of the converter [V].
-            amplitude: Amplitudes that were given, the newest first.
-            adc_range: Range of the converter [V].
-        """
+        """Windows [V] and amplitudes that the tracker gets; of those given the newest is first."""
         v, told, bad = v.copy(), amplitude[0].copy(), np.flatnonzero(self.fault[number])
         if self.name == "clipped, range known":
             v[bad] = np.clip(v[bad] + adc_range[1] - 1.0, *adc_range)
@@ -149,13 +140,7 @@ class Given:
 
 
 class Hazards:
-    """A calibrated driver, and the loads that its display meets.
-
-    Args:
-        snr: Signal-to-noise ratio [dB].
-        seed: Seed of everything.
-        samples: Length of a calibration [samples].
-    """
+    """A calibrated driver, and the loads that its display meets."""
 
     def __init__(self, snr: float, seed: int, samples: int = 40_000) -> None:
         scene = Scene((), TWO, samples=samples, snr_db=snr, trigger_jitter_rms=100e-9)

@@ -1,11 +1,10 @@
 """A display whose loads change at every pulse, and the loop that is closed around it.
 
 Nothing here is shared with what `etid.online` predicts. The response of each load to one pulse from
-rest comes from the circuit of the transformer at 120 000 frequencies (`by_circuit`), or from
-ngspice (`by_ngspice`). The circuit is linear: a pulse of amplitude A after pulses of amplitude B
-and C is A u(t) + B u(t + T) + C u(t + 2T). The charge is the integral of the current over the phase
-of the unloaded voltage, on a grid of 0.4 µs. Where a load changes, the tails of the pulses before
-are those of the new load.
+rest comes from the circuit of the transformer (`by_circuit`) or from ngspice (`by_ngspice`). The
+circuit is linear: a pulse of amplitude A after pulses of amplitude B and C is A u(t) + B u(t + T) +
+C u(t + 2T). The charge is the integral of the current over the phase of the unloaded voltage, on a
+grid of 0.4 µs. Where a load changes, the tails of the pulses before are those of the new load.
 """
 
 import dataclasses
@@ -74,19 +73,11 @@ def by_ngspice(scene: Scene, load: Load) -> Waves:
 
 
 class Display:
-    """A display at 60 Hz and 200 kHz.
+    """A display at 60 Hz and 200 kHz, and the loads that its electrodes may meet.
 
-    Attributes:
-        charge: Charge of a pulse of unit amplitude from rest in its own phase and in the next ones,
-            through each load [C] (load, older).
-        peak: Largest current of either sign of such a pulse through each load [A].
-        mean: Mean terminal voltage in its phase [V].
-
-    Args:
-        scene: Driver and converter.
-        loads: The loads that the electrodes may meet.
-        seed: Seed of noise and delays.
-        source: Gives the pulse through each load.
+    Of a pulse of unit amplitude from rest it knows the `charge` in its own phase and in the next
+    ones [C] (load, older), the `peak` of the current of either sign [A], and the `mean` terminal
+    voltage in its phase [V].
     """
 
     def __init__(
@@ -128,12 +119,7 @@ class Display:
     def charges(
         self, load: Int[np.ndarray, " lane"], amplitude: Float[np.ndarray, "older lane"]
     ) -> Float[np.ndarray, " lane"]:
-        """Charge of a pulse at every electrode [C].
-
-        Args:
-            load: Number of the load at each electrode.
-            amplitude: Amplitudes of this pulse and of those before, the newest first.
-        """
+        """Charge of a pulse at every electrode [C]; `amplitude` has the newest pulse first."""
         return np.sum(self.charge[load].T * amplitude[: self.older], axis=0)
 
     def windows(
@@ -202,13 +188,9 @@ SETTLED = 2  # pulses after a change that do not count: the target begins with t
 
 
 class Fingertip:
-    """The skin at each electrode and pulse.
+    """The skin at each electrode and pulse: the number of one of its loads (pulse, lane).
 
-    Attributes:
-        kind: What happens to the skin at each electrode.
-        loads: All skins, typical dry skin first.
-        load: Number of the skin (pulse, lane).
-        counts: Pulses that count: neither a change nor one of the two that follow it (pulse, lane).
+    `counts` are the pulses that count: neither a change nor one of the two that follow it.
     """
 
     def __init__(self, electrodes: int, pulses: int) -> None:

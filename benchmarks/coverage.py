@@ -2,16 +2,13 @@
 
 Each repetition draws fresh noise, quantisation and trigger delays for the calibrations, a dry and a
 damp trial, and identifies a driver of its own: trials that share a driver share its error, and
-would not be independent draws. With `--parts` the parts of the driver are drawn anew as well. With
-`--current-snr-db` the loads are identified from the current alone, without calibrations; with
-`--resistors` too, from driver and current at once.
+would not be independent draws. With `--current-snr-db` the loads are identified from the current
+alone, without calibrations; with `--resistors` too, from driver and current at once.
 
 Printed are, beside the bound, the part of the 95 % intervals that hold the truth and the root mean
 square of z = error / standard error, each with the range that 99 of 100 runs with right standard
-errors fall into: of a binomial count, and of chi-squared with a degree of freedom for each fit.
-
-The targets of each method and load are those of `TARGETS`. The coverage is that of all elements of
-a load: that of a single one scatters by 1.5 % with 200 draws, and is printed without a target.
+errors fall into: of a binomial count, and of chi-squared with a degree of freedom for each fit. The
+target is of all elements of a load: a single one scatters by 1.5 % with 200 draws.
 """
 
 import argparse
@@ -127,19 +124,15 @@ def with_driver(of: Scene, number: int, parts: float) -> Scene:
     return dataclasses.replace(of, driver=drawn_driver(number, parts, of.driver)) if parts else of
 
 
-def compared(fit: etid.Fit | None, truth: Sequence[float]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Relative error and standard error of the elements of a fit, if there is one; its verdict."""
-    values, stderr, verdict = found_by(fit, len(truth))
-    return values / np.array(truth) - 1, stderr / np.array(truth), verdict
-
-
 def draw(fit: etid.Fit | None, truth: Sequence[float]) -> tuple:
-    """A row of `Draws`."""
-    size = len(truth)
-    if fit is None:
-        return *compared(fit, truth), np.full((size, size), np.nan), np.nan, False
-    limited = bool(int(fit.remarks) & Remark.small_delays)
-    return *compared(fit, truth), fit.cov / np.outer(truth, truth), float(fit.chi2), limited
+    """A row of `Draws`, if there is a fit."""
+    true, size = np.array(truth), len(truth)
+    values, stderr, verdict = found_by(fit, size)
+    cov, chi2, limited = np.full((size, size), np.nan), np.nan, False
+    if fit is not None:
+        cov, chi2 = fit.cov / np.outer(true, true), float(fit.chi2)
+        limited = bool(int(fit.remarks) & Remark.small_delays)
+    return values / true - 1, stderr / true, verdict, cov, chi2, limited
 
 
 def monte_carlo(
@@ -149,14 +142,9 @@ def monte_carlo(
     parts: float = 0.0,
     drivers: Drivers | None = None,
 ) -> dict[str, Draws]:
-    """Identify fresh recordings of each trial of `scene`.
+    """Identify fresh recordings of each trial of `scene`, behind drivers drawn with this spread.
 
-    Args:
-        scene: What is recorded.
-        repetitions: How often.
-        method: As in `identify_skin`, or `joint`.
-        parts: Standard deviation of the logarithm of every part of the drivers.
-        drivers: Those that other methods have identified from the same draws.
+    `drivers` are those that other methods have identified from the same draws.
     """
     every = {trial.path: list(scene.truth()[trial.path].values()) for trial in scene.trials}
     truth = {path: values for path, values in every.items() if not path.startswith(MORE)}
@@ -171,26 +159,27 @@ def identified(
     drivers: Drivers | None = None,
 ) -> dict[str, Draws]:
     """Identify the recordings of studies whose elements are known by their paths."""
-    every, known, paths = list(studies), drivers or Drivers(), list(truth)
+    every, known = list(studies), drivers or Drivers()
     if method == JOINT:
-        rows = [_jointly(study, paths) for study in tqdm(every, disable=None)]
+        rows = []
+        for study in tqdm(every, disable=None):
+            fits = etid.identify_jointly(study).fits
+            rows.append({path: fits[i] for i, path in enumerate(fits.labels["path"])})
     elif every[0].calibrations:
-        rows = [_behind_driver(study, paths, method, known) for study in tqdm(every, disable=None)]
-    else:
-        rows = _from_current(every, paths, method)
+        rows = [_behind_driver(of, truth, method, known) for of in tqdm(every, disable=None)]
+    else:  # all draws of a trial as one batch, for no driver differs
+        by_path = {
+            path: etid.identify_skins([study[path] for study in every], None, method=method)
+            for path in truth
+        }
+        rows = [{path: fits[i] for path, fits in by_path.items()} for i in range(len(every))]
     return {
         path: Draws.of([draw(row.get(path), true) for row in rows]) for path, true in truth.items()
     }
 
 
-def _jointly(study: etid.Study, paths: Sequence[str]) -> dict[str, etid.Fit]:
-    fits = etid.identify_jointly(study).fits
-    found = list(fits.labels["path"])
-    return {path: fits[found.index(path)] for path in paths}
-
-
 def _behind_driver(
-    study: etid.Study, paths: Sequence[str], method: str | None, drivers: Drivers
+    study: etid.Study, paths: Iterable[str], method: str | None, drivers: Drivers
 ) -> dict[str, etid.Fit]:
     """Fits by path; none if the driver of the calibrations failed."""
     driver = drivers.of(list(study.calibrations.recordings()), method or DEFAULT)
@@ -199,17 +188,6 @@ def _behind_driver(
     return {
         path: etid.identify_skin(study[path], driver, method=method, throw=False) for path in paths
     }
-
-
-def _from_current(
-    studies: Sequence[etid.Study], paths: Sequence[str], method: str | None
-) -> list[dict[str, etid.Fit]]:
-    """All draws of a trial as one batch, for no driver differs."""
-    every = {
-        path: etid.identify_skins([study[path] for study in studies], None, method=method)
-        for path in paths
-    }
-    return [{path: fits[i] for path, fits in every.items()} for i in range(len(studies))]
 
 
 def lines(name: str, of: Draws, bounds: dict[str, float]) -> Iterator[str]:

@@ -19,7 +19,7 @@ import etid
 from benchmarks import charts, peers
 from benchmarks.machine import median_time, write_csv
 from benchmarks.peers import START, Problem, harmonics, problem, problem_of, terms
-from benchmarks.runner import QUICK, option
+from benchmarks.runner import QUICK, option, show
 from etid.estimators.maximum_likelihood.search import WELL
 
 PINNED = True
@@ -37,10 +37,6 @@ AXES = {
 }
 
 Row = dict[str, Any]
-
-
-def _row(against: str, what: str, number: int, seconds: float) -> Row:
-    return {"against": against, "what": what, "number": number, "seconds": seconds}
 
 
 def seconds(call: Callable[[], Any]) -> float:
@@ -83,7 +79,7 @@ def against_samples(sizes: Sequence[int]) -> Iterator[Row]:
     base = problem(10_000, 1)
     for size in sizes:
         for name, call in calls(stretched(base, size)).items():
-            yield _row("samples", name, size, seconds(call))
+            yield {"against": "samples", "what": name, "number": size, "seconds": seconds(call)}
 
 
 def against_lanes(counts: Sequence[int]) -> Iterator[Row]:
@@ -111,7 +107,7 @@ def against_lanes(counts: Sequence[int]) -> Iterator[Row]:
                 break
             index = np.arange(count) % len(of.records)
             each = seconds(lambda run=run, index=index: run(index)) / done
-            yield _row("lanes", name, count, each)
+            yield {"against": "lanes", "what": name, "number": count, "seconds": each}
 
 
 def with_slopes(rows: Iterable[Row]) -> Iterator[Row]:
@@ -149,11 +145,7 @@ def main(arguments: argparse.Namespace) -> bool:
         itertools.chain(against_samples(SAMPLES[few]), against_lanes(LANES[few]))
     ):
         table.append(row)
-        print(
-            f"{row['against']:<9}{row['what']:<36}{row['number']:>9}{1e3 * row['seconds']:12.4f} ms"
-            f"  slope {row['slope']:.2f}",
-            flush=True,
-        )
+        show(row)
     write_csv(arguments.folder / "curves.csv", table)
     draw(table, arguments.folder / "curves.svg")
     return True

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -9,85 +10,72 @@ from jaxtyping import Complex, Float
 from etid.simulation.transformer import Impedance, Sampler, SkinLoad, TransformerDriver
 
 Volts = Float[np.ndarray, " time"]
+Added = Callable[[Volts, np.random.Generator], Volts]
+"""A voltage at the converter [V] that does not come from the driver, at times [s]."""
+
 ROUNDS = 60  # of a fixed point that gains a factor of 1.5 at least
 
 
-@dataclasses.dataclass(frozen=True)
-class Hum:
-    """A sine, and its harmonics at a third of its amplitude each."""
+def hum(
+    frequency: float,
+    amplitude: float,
+    harmonics: tuple[int, ...] = (),
+    phase: float | None = None,
+) -> Added:
+    """A sine [Hz, V], and its harmonics at a third of its amplitude each.
 
-    frequency: float  # of the sine [Hz]
-    amplitude: float  # at the converter [V]
-    harmonics: tuple[int, ...] = ()  # multiples of the frequency that come with it
-    phase: float | None = None  # in turns; drawn for each record if it is None
+    Its phase [turns] is drawn for each record if it is not given.
+    """
 
-    def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
-        """Volts at these times [s]."""
-        turns = self.frequency * time + (rng.random() if self.phase is None else self.phase)
-        total = self.amplitude * np.sin(2 * np.pi * turns)
-        for number in self.harmonics:
+    def volts(time: Volts, rng: np.random.Generator) -> Volts:
+        turns = frequency * time + (rng.random() if phase is None else phase)
+        total = amplitude * np.sin(2 * np.pi * turns)
+        for number in harmonics:
             own = number * turns + rng.random()
-            total = total + self.amplitude / 3 * np.sin(2 * np.pi * own)
+            total = total + amplitude / 3 * np.sin(2 * np.pi * own)
         return total
 
+    return volts
 
-@dataclasses.dataclass(frozen=True)
-class Offset:
+
+def offset(volts: float) -> Added:
     """A constant voltage."""
-
-    volts: float  # at the converter [V]
-
-    def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
-        """Volts at these times [s]."""
-        return np.full(time.shape, self.volts)
+    return lambda time, _: np.full(time.shape, volts)
 
 
-@dataclasses.dataclass(frozen=True)
-class Spike:
-    """Half a sine at a random place in one of the periods, as when a hand moves; or a rectangle."""
+def spike(height: float, width: float, rectangular: bool = False) -> Added:
+    """Half a sine [V, s] at a random place, as when a hand moves; or a rectangle."""
 
-    height: float  # at the converter [V]
-    width: float  # from its begin to its end [s]
-    rectangular: bool = False
+    def volts(time: Volts, rng: np.random.Generator) -> Volts:
+        place = (time - rng.uniform(0.0, time[-1] - width)) / width
+        shape = 1.0 if rectangular else np.sin(np.pi * np.clip(place, 0, 1))
+        return np.where((place > 0) & (place < 1), height * shape, 0.0)
 
-    def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
-        """Volts at these times [s]."""
-        begin = rng.uniform(0.0, time[-1] - self.width)
-        place = (time - begin) / self.width
-        inside = (place > 0) & (place < 1)
-        shape = 1.0 if self.rectangular else np.sin(np.pi * np.clip(place, 0, 1))
-        return np.where(inside, self.height * shape, 0.0)
+    return volts
 
 
-@dataclasses.dataclass(frozen=True)
-class Tail:
-    """An exponential tail after every pulse, as dielectric absorption leaves it."""
+def tail(height: float, time_constant: float, end: float, period: float) -> Added:
+    """An exponential [V, s] after the end of every pulse, as dielectric absorption leaves it."""
 
-    height: float  # at the end of a pulse [V at the converter]
-    time_constant: float  # [s]
-    end: float  # of the first pulse [s]
-    period: float  # [s]
+    def volts(time: Volts, _: np.random.Generator) -> Volts:
+        since = np.mod(time - end, period)
+        before = 1 - np.exp(-period / time_constant)  # what is left of earlier tails
+        return height * np.exp(-since / time_constant) / before
 
-    def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
-        """Volts at these times [s]."""
-        since = np.mod(time - self.end, self.period)
-        before = 1 - np.exp(-self.period / self.time_constant)  # what is left of earlier tails
-        return self.height * np.exp(-since / self.time_constant) / before
+    return volts
 
 
-@dataclasses.dataclass(frozen=True)
-class Pink:
-    """Noise with a power of 1/f above the first frequency of the record."""
+def pink(rms: float) -> Added:
+    """Noise with a power of 1/f above the first frequency of the record, and this rms [V]."""
 
-    rms: float  # effective value at the converter [V]
-
-    def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
-        """Volts at these times [s]."""
+    def volts(time: Volts, rng: np.random.Generator) -> Volts:
         white = np.fft.rfft(rng.standard_normal(time.size))
         white[0] = 0.0
         white[1:] /= np.sqrt(np.arange(1, white.size))
         found = np.fft.irfft(white, time.size)
-        return self.rms * found / np.std(found)
+        return rms * found / np.std(found)
+
+    return volts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,19 +89,6 @@ class Leaky:
         """Impedance [ohm] at frequencies f [Hz]."""
         z = self.load(f)
         return z * self.r / (z + self.r)
-
-
-@dataclasses.dataclass(frozen=True)
-class Shunted:
-    """A load with a capacitor across it."""
-
-    load: Impedance  # the load
-    c: float  # the capacitor [F]
-
-    def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
-        """Impedance [ohm] at frequencies f [Hz]."""
-        z = self.load(f)
-        return z / (1 + 2j * np.pi * f * self.c * z)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,10 +7,9 @@ Cramer-Rao bound, for it and for every fixed order, and how many of its 95 % int
 truth. Fits of all verdicts count: a verdict must not flatter the numbers.
 
 A choice is right if the fixed order of this number has an error of at most `AS_GOOD` times that of
-the best fixed order. It is right too if the elements differ by at most `NEAR` bounds from those of
-the best fixed order (root mean square): some drivers show a pole less than the others. The orders
-chosen for the SPICE recordings are shown too, where they are present: their driver shows three to
-four poles at 60 dB, and five without noise.
+the best fixed order, or if the elements differ by at most `NEAR` bounds from those of the best one
+(root mean square): some drivers show a pole less than the others. The orders chosen for the SPICE
+recordings are shown too, where they are present.
 """
 
 import argparse

@@ -2,14 +2,10 @@
 
 An element is *wrong* if it is off by more than five standard deviations of its Cramer-Rao bound,
 or by more than 20 %. It is wrong *silently* if the verdict is `successful` and five of its own
-standard errors do not cover the truth either; a method that gives none covers nothing. Any other
-verdict of the fit, and a calibration or record that pre-flight refuses, is a method that says so.
-What a fit says counts, not what its driver said: a batch has the fits only.
-
-Where the bound of an element exceeds 4 %, five sd are more than 20 %: it is wrong sometimes in any
-answer, and silent only if its own standard errors are wrong too. Where it exceeds 10 % nothing is
-asked of it. What the elements are of skin that is not one RC is a matter of words to a few per
-cent: they are wrong by 20 % only.
+standard errors do not cover the truth either; a method that gives none covers nothing. What a fit
+says counts, not what its driver said: a batch has the fits only. Nothing is asked of an element
+whose bound exceeds 10 %. Those of skin that is not one RC are a matter of words to a few per cent:
+they are wrong by 20 % only.
 """
 
 import dataclasses
@@ -110,42 +106,28 @@ class Drivers:
     def __init__(self, order: Order = 5):
         self.order: Order = order
         self.known: dict[tuple, etid.Driver | None] = {}
-        self.times: dict[str | None, list[float]] = {}
+        self.times: dict[str, list[float]] = {}
 
-    def kind(self, calibrations: Sequence[etid.Recording], name: str) -> str | None:
-        """The method that identifies the driver for a method, or for the default one."""
-        seen = [Inspected(record) for record in calibrations]
-        return shared(str(for_calibrations(None, seen)) if name == DEFAULT else name)
+    def kind(self, calibrations: Sequence[etid.Recording], name: str) -> str:
+        """The method that identifies the driver: on the harmonics, that of maximum likelihood."""
+        if name == DEFAULT:
+            name = str(for_calibrations(None, [Inspected(record) for record in calibrations]))
+        return "maximum_likelihood" if named(name).lane.periodic else name
 
     def of(self, calibrations: Sequence[etid.Recording], name: str) -> etid.Driver | None:
-        """The driver for a method; None if pre-flight refuses a calibration."""
+        """The driver for a method, whatever its verdict; None if a calibration is refused."""
         kind = self.kind(calibrations, name)
-        key = kind, *((*map(_checksum, r.samples.values()), r.metadata) for r in calibrations)
+        samples = (of for record in calibrations for of in record.samples.values())
+        sums = (zlib.crc32(of.stored.tobytes()) for of in samples)
+        key = kind, *sums, *(record.metadata for record in calibrations)
         if key not in self.known:
-            begin = time.perf_counter()
-            self.known[key] = driver_of(calibrations, kind, self.order)
+            begin, asked = time.perf_counter(), {"order": self.order, "method": kind}
+            try:
+                self.known[key] = etid.identify_driver(calibrations, **asked, throw=False)
+            except etid.IdentificationError:
+                self.known[key] = None
             self.times.setdefault(kind, []).append(time.perf_counter() - begin)
         return self.known[key]
-
-
-def _checksum(samples: etid.Samples) -> int:
-    return zlib.crc32(samples.stored.tobytes())
-
-
-def shared(method: str | None) -> str | None:
-    """The method whose driver a method uses: all on the harmonics that of maximum likelihood."""
-    periodic = method is not None and named(method).lane.periodic
-    return "maximum_likelihood" if periodic else method
-
-
-def driver_of(
-    calibrations: etid.Recording | Sequence[etid.Recording], method: str | None, order: Order = 5
-) -> etid.Driver | None:
-    """The driver, whatever its verdict; None if pre-flight refuses a calibration."""
-    try:
-        return etid.identify_driver(calibrations, order=order, method=method, throw=False)
-    except etid.IdentificationError:
-        return None
 
 
 def method_of(name: str) -> str | None:

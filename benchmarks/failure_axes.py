@@ -1,12 +1,12 @@
 """Where methods may fail: nine pairs of axes, and the scene of every cell.
 
-Every cell differs from the middle of the ladder, 60 dB, three periods at 200 kHz, delays of 50 ns
-rms, in its row and its column. It has one calibration, and trials with dry and damp skin by turns,
-which share the driver identified from it.
+Every cell differs from the middle of the ladder in its row and its column. It has one calibration,
+and trials with dry and damp skin by turns, which share the driver identified from it.
 """
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -209,13 +209,8 @@ def _level(ratio: float, skin: SkinLoad) -> SkinLoad:
 
 def transformer(order: int) -> TransformerDriver:
     """The driver with as many poles, 2 to 6."""
-    lost = {
-        name: value
-        for poles, part in LOST.items()
-        if poles >= order
-        for name, value in part.items()
-    }
-    return TransformerDriver(**lost)
+    lost = [part for poles, part in LOST.items() if poles >= order]
+    return TransformerDriver(**functools.reduce(operator.or_, lost))
 
 
 def cells() -> Iterator[Cell]:

@@ -47,18 +47,6 @@ def elements(load: Impedance | AbstractCircuit) -> SkinLoad:
     return load
 
 
-def _fitted(circuit: AbstractCircuit) -> np.ndarray:
-    if isinstance(circuit, Resistor):
-        return np.array([np.nan, float(circuit.r), np.nan])
-    return np.asarray(circuit.values())
-
-
-def _true(skin: SkinLoad, circuit: AbstractCircuit) -> np.ndarray:
-    if isinstance(circuit, Resistor):
-        return np.array([np.nan, skin.r_s + skin.r_p, np.nan])
-    return np.array(dataclasses.astuple(skin))
-
-
 def bounds(scene: Scene) -> dict[str, np.ndarray]:
     """Relative bounds of the elements by path; NaN where an element does not exist."""
     loads = {t.path: t.load for t in scene.trials}
@@ -113,9 +101,14 @@ def judged(cell: Cell, name: str, seed: int, path: str, fit: Fit, bound: np.ndar
     if name == AUTO:
         truth, (value, stderr) = np.array(dataclasses.astuple(true)), limits(fit)
         exact = exact and isinstance(fit.circuit, SkinRC)
+    elif isinstance(fit.circuit, Resistor):
+        truth, value, stderr = (
+            np.array([np.nan, float(r), np.nan])
+            for r in (true.r_s + true.r_p, fit.circuit.r, fit.stderr.r)
+        )
     else:
-        truth = _true(true, fit.circuit)
-        value, stderr = _fitted(fit.circuit), _fitted(fit.stderr)
+        truth = np.array(dataclasses.astuple(true))
+        value, stderr = (np.asarray(of.values()) for of in (fit.circuit, fit.stderr))
     return Answer(
         *(name, seed, path, fit.verdict),
         error=value / truth - 1,

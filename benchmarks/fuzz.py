@@ -1,9 +1,8 @@
 """Damaged files: crashes, hangs, memory and errors that are not etid's own.
 
-Every file is a good one that was damaged as its kind and seed say. Child processes read thousands
-of them each; one that takes longer than `--limit`, dies, or allocates more than a gigabyte is
-counted and named by kind and seed, and `--kind KIND --first SEED --files 1` repeats it. What may
-come out is an answer or one `etid.RecordingError`.
+Child processes read thousands of them each; one that takes longer than `--limit`, dies, or
+allocates more than a gigabyte is counted and named by kind and seed, and `--kind KIND --first SEED
+--files 1` repeats it. What may come out is an answer or one `etid.RecordingError`.
 """
 
 import argparse
@@ -30,7 +29,7 @@ import numpy as np
 
 import etid
 from benchmarks import specimens
-from benchmarks.runner import option
+from benchmarks.runner import option, show
 
 MEMORY = 1 << 30  # bytes that a process may have in memory
 SAFETY = 4 << 30  # bytes of addresses beside those after the imports, for the sake of this machine
@@ -66,10 +65,8 @@ def main(arguments: argparse.Namespace) -> bool:
         if found["outcome"] not in FINE:
             faults.append(found)
             print(f"{found['kind']} {found['seed']}: {found['outcome']}\n{found['detail']}\n")
-    print(f"{'':<12}{'files':>8}{'read':>8}{'refused':>8}{'faults':>8}")
     for kind, own in counts.items():
-        wrong = own.total() - own["read"] - own["refused"]
-        print(f"{kind:<12}{own.total():>8}{own['read']:>8}{own['refused']:>8}{wrong:>8}")
+        show({"kind": kind, "files": own.total(), **own})
     print(
         f"{len(faults)} faults in {len(cases)} files; slowest {slowest:.2f} s, "
         f"peak memory {largest / 2**20:.0f} MB, {time.perf_counter() - started:.0f} s in all"

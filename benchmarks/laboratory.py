@@ -1,15 +1,13 @@
 """Recordings as a laboratory makes them: every voltage has its own driver, load, clock and faults.
 
-`etid.scenes` records a study in which all is well. Here each of the two voltages of a recording is
-an `Output` that can be changed alone, and a `Record` can tell its file what is not true. The
-waveforms are the exact periodic ones of `etid.simulation.transformer`:
+Each of the two voltages of a recording is an `Output` that can be changed alone, and a `Record` can
+tell its file what is not true. The waveforms are the exact ones of `etid.simulation.transformer`:
 
     pulses → driver and load → gain → anti-alias filter → sampling → · scale → + added voltages
     + white noise → rounding to a code, clipped at the full scale.
 
 Where the load differs from pulse to pulse, the records of each load are joined between the pulses.
-The voltage is at rest there but for the 2 % of the droop that the transformer has left, of which a
-change of the load by 5 % shows some 0.1 mV of 50 V.
+The voltage is at rest there but for the 2 % of the droop that the transformer has left.
 """
 
 import dataclasses
@@ -20,6 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
+from benchmarks.disturbances import Added
 from etid.recordings.recording import Recording, Samples
 from etid.simulation.scenes import Scene
 from etid.simulation.transformer import Impedance, OpenLoad, Sampler, TransformerDriver, loading
@@ -27,9 +26,6 @@ from etid.simulation.transformer import Impedance, OpenLoad, Sampler, Transforme
 SCALE = Scene().scale  # volts at the converter per volt at the terminal
 CORNER = Scene().antialias  # of the usual anti-alias filter, relative to the sample rate
 TAYLOR = 3  # terms of a voltage at jittered times: the next is 1e-4 of a step at half a sample
-
-Added = Callable[[Float[np.ndarray, " time"], np.random.Generator], Float[np.ndarray, " time"]]
-"""A voltage at the converter [V] that does not come from the driver, at times [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,23 +99,6 @@ class Output:
         for added in self.added:
             volts = volts + added(time, rng)
         return volts
-
-
-@dataclasses.dataclass(frozen=True)
-class Crosstalk:
-    """A part of another voltage, as through the capacitance between two channels."""
-
-    output: Output  # the other voltage
-    part: float  # of it that is seen
-    later: float = 0.0  # by how much its pulse is later [s]
-    sample_rate: float = 200e3  # of the converter [Hz]
-
-    def __call__(
-        self, time: Float[np.ndarray, " time"], rng: np.random.Generator
-    ) -> Float[np.ndarray, " time"]:
-        """Volts at the converter."""
-        other = dataclasses.replace(self.output, delay=self.output.delay - self.later)
-        return self.part * other.volts(self.sample_rate, time.size, rng)
 
 
 @dataclasses.dataclass(frozen=True)

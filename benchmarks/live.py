@@ -3,7 +3,7 @@
 Pulses of 98 electrodes come at 60 Hz for ten minutes, and windows read the page ten times a second.
 A tick is late because of the page if it fits into a pulse period, but not together with what is
 handed over. Wall time contains what other programs of the machine take, the processor's time of
-this process does not. The table is `live.csv`. A missed target makes the command end with 1.
+this process does not.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from collections.abc import Iterator
 import numpy as np
 
 import etid
-from benchmarks.machine import RESULTS, write_csv
+from benchmarks.machine import RESULTS
 from benchmarks.online import CHARGE, problem
 from benchmarks.runner import Target, at_most, option, report
 from etid.live.loop import Tick, follow
@@ -42,19 +42,15 @@ OPTIONS = (
     option("--electrodes", default=98),
     option("--minutes", default=10.0),
     option("--windows", default=2, help="readers of the page"),
-    option("--port", default=0, help="of the page, to open it in a browser; 0: any"),
     option("-o", "--output", type=pathlib.Path, default=RESULTS / "live.csv"),
 )
 
 
 class Timed(LiveView):
-    """A view that notes of each tick whether it was shown, and what this took.
+    """A view that notes what each tick took."""
 
-    Attributes:
-        taken: By tick: whether a snapshot was due; time by the clock and of the processor for it,
-            and time of the processor for the tick [s].
-    """
-
+    # Whether a snapshot was due; time by the clock and of the processor for it, and time of the
+    # processor for the tick [s].
     taken: list[tuple[bool, float, float, float]]
     last = 0.0
 
@@ -70,12 +66,12 @@ class Timed(LiveView):
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table and write it; whether all targets are met."""
-    tracker, pulses = problem(arguments.electrodes, 0)
+    tracker, pulses = problem(arguments.electrodes)
     controller = etid.Controller.of(tracker)
     period = tracker.period / tracker.model.bands.sample_rate
     number = round(60 * arguments.minutes / period)
     ticks, memory = [], []
-    view = Timed(controller, charge=CHARGE, controls=False, port=arguments.port)
+    view = Timed(controller, charge=CHARGE, controls=False)
     view.taken = []
     with view:
         print(view.address, flush=True)
@@ -97,9 +93,8 @@ def main(arguments: argparse.Namespace) -> bool:
     grown = np.diff(np.array(memory) / 1e6, axis=0)[0]
 
     def late(tick: np.ndarray, handed: np.ndarray) -> int:
-        return int(
-            ((tick < period) & (tick + handed >= period))[1:].sum()
-        )  # the first one compiles
+        # The first one compiles.
+        return int(((tick < period) & (tick + handed >= period))[1:].sum())
 
     numbers = {
         "ticks": len(ticks),
@@ -109,24 +104,20 @@ def main(arguments: argparse.Namespace) -> bool:
         "median of a hand-over [ms]": 1e3 * np.median(wall[shown]),
         "median of a hand-over [ms], by the processor's time": 1e3 * np.median(busy[shown]),
         "p99 of the hand-over / pulse period": np.percentile(wall, 99) / period,
-        "p99 of the hand-over / pulse period, by the processor's time": (
-            np.percentile(busy, 99) / period
-        ),
+        "p99 of the hand-over / pulse period, by the processor's time": np.percentile(busy, 99)
+        / period,
         "ticks that are late by themselves": int((seconds >= period).sum()),
         "ticks that are late because of the page": late(seconds, wall),
         "ticks that are late because of the page, by the processor's time": late(working, busy),
         "growth of the loop's memory [MB]": grown[0],
         "growth of the page's memory [MB]": grown[1],
     }
+    limits = (TARGETS.get(name, (np.nan, np.nan)) for name in numbers)
     found = [
-        Target(name, float(value), *TARGETS.get(name, (np.nan, np.nan)))
-        for name, value in numbers.items()
+        Target(name, float(value), *of)
+        for (name, value), of in zip(numbers.items(), limits, strict=True)
     ]
-    rows = [
-        {"quantity": of.name, "value": of.value, "least": of.least, "most": of.most} for of in found
-    ]
-    write_csv(arguments.output, rows)
-    return report(found)
+    return report(found, arguments.output)
 
 
 def paced(tracker: etid.Tracker, pulses: np.ndarray, number: int) -> Iterator[Block]:

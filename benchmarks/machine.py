@@ -109,12 +109,16 @@ def import_time(module: str) -> float:
 
 def median_time(call: Callable[[], Any], repeats: int) -> float:
     """Median wall time [s] after a first call."""
-    runs = []
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        runs.append(time.perf_counter() - start)
-    return float(np.median(runs[1:]))
+    return float(np.median([timed(call)[1] for _ in range(repeats + 1)][1:]))
+
+
+def timed(
+    call: Callable[[], Any], clock: Callable[[], float] = time.perf_counter
+) -> tuple[Any, float]:
+    """What a call gives, and how long it takes [s]."""
+    begin = clock()
+    found = jax.block_until_ready(call())
+    return found, clock() - begin
 
 
 def make_room() -> None:

@@ -1,21 +1,15 @@
 """Would the tests tell? Bugs are put in, one at a time, and the tests that execute them run.
 
-    python -m benchmarks mutation --mutants 40 --modules estimators.judgement signals.harmonics
-
 Mutants (`benchmarks.mutants`) are drawn by a seed from all modules of etid, in a copy of the
 working tree. First every file of the ordinary tests runs once, in a process of its own, and its
 executed lines are noted. A mutant is then judged by all files that execute its line; one outside of
 functions, by all files that execute any function of the module. Tests that killed a mutant of the
 module come first, then the fastest files. A mutant that all of them let pass has survived, and so
-has one that no test executes. Some are no bug at all: another start of an iteration, a tolerance
-that nothing depends on; they are counted all the same.
+has one that no test executes. Some are no bug at all; they are counted all the same.
 
-Outcomes are kept as long as the commit is the same, and mutants are done in the order in which they
-were drawn: what is done is a fair sample. The table is `mutation.csv`.
-
-The tools mutmut and cosmic-ray are no substitute: mutmut wraps every function, which compiled code
-and checks of types see, and cosmic-ray starts Python and JAX anew for each mutant and runs the same
-tests for all.
+Mutants are done in the order in which they were drawn: what is done is a fair sample. mutmut wraps
+every function, which compiled code and checks of types see, and cosmic-ray starts Python and JAX
+anew for each mutant and runs the same tests for all.
 """
 
 import argparse
@@ -87,11 +81,8 @@ def _run(folder: str, tests: Sequence[str], module: str, answer: Connection) -> 
     import pytest
 
     failed, noted = _Failed(), coverage.Coverage(data_file=None, source=[f"{folder}/etid"])
-    options = [
-        *("-q", "-x"),
-        # Modules of plugins are loaded already, and their assertions are not rewritten.
-        *("-W", "ignore::pytest.PytestAssertRewriteWarning"),
-    ]
+    # Modules of plugins are loaded already, and their assertions are not rewritten.
+    options = ["-q", "-x", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
     if module:  # to check the types of all modules takes longer than to load them
         options.append(f"--jaxtyping-packages={module},beartype.beartype")
     with contextlib.nullcontext() if module else noted.collect():
@@ -106,9 +97,7 @@ def _run(folder: str, tests: Sequence[str], module: str, answer: Connection) -> 
 class Tree:
     """A copy of a project, whose tests run each time in a new process.
 
-    Args:
-        root: The working tree.
-        beside: An empty folder. Bytecode, caches and the log of the last tests lie in it too.
+    Beside it lie bytecode, caches and the log of the last tests.
     """
 
     def __init__(self, root: pathlib.Path, beside: pathlib.Path) -> None:
@@ -142,11 +131,7 @@ class Tree:
             process.join()
 
     def executed(self, test: str) -> tuple[float, Mapping[str, Sequence[int]]]:
-        """How long a file of tests takes [s], and the lines of etid that it executes.
-
-        Raises:
-            SystemExit: The tests fail without any mutant.
-        """
+        """How long a file of tests takes [s], and the lines of etid that it executes."""
         begun = time.perf_counter()
         found = self.judged([test], "", 10 * LIMIT)
         if not found.passed:
@@ -180,13 +165,7 @@ def judges(
     executed: Mapping[str, tuple[float, Mapping[str, Sequence[int]]]],
     calls: set[int],
 ) -> list[str]:
-    """Files of tests that execute a mutant, the fastest first.
-
-    Args:
-        mutant: The change.
-        executed: Time and executed lines of each file.
-        calls: Lines of the module that calls run.
-    """
+    """Files of tests that execute a mutant, the fastest first; `calls` are lines that calls run."""
     lines = {mutant.line} if mutant.inside else calls
     of = {
         test: seconds
@@ -208,8 +187,9 @@ def show(rows: Sequence[Mapping[str, Any]]) -> Target:
         print(f"  {row['place']}: {row['kind']}: {row['before'][:70]}  ->  {row['after'][:70]}")
     [(name, limits)] = TARGETS.items()
     share, interval = len(left) / len(rows), clopper_pearson(len(left), len(rows))
-    low, high = interval
-    text = f"{len(left)} of {len(rows)}, {share:.0%} (95 %: {low:.0%} to {high:.0%})"
+    text = "{} of {}, {:.0%} (95 %: {:.0%} to {:.0%})".format(
+        len(left), len(rows), share, *interval
+    )
     return Target(name, share, *limits, text, interval)
 
 

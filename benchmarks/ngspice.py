@@ -1,22 +1,16 @@
 """An independent referee: the transformer of a scene solved by ngspice, step by step in time.
 
 `record(scene, seed)` stands in for `scene.simulate(seed)`. The waveform comes from ngspice (Debian
-package `ngspice`), the recorder is the scene's own: anti-alias filter, clock, delays, noise and
-converter, with the same draws. The two studies differ by the simulator alone.
+package `ngspice`), the recorder is the scene's own, with the same draws. The two studies differ by
+the simulator alone. One run per circuit and load, kept in memory and in `CACHE`, serves all draws
+of noise; it takes half a second.
 
-One run per circuit and load, kept in memory and in `CACHE`, serves all draws of noise. ngspice
-chooses its own steps, which RELTOL bounds; a run takes half a second. The largest deviation from
-`Scene.waveform`, relative to the peak, after the anti-alias filter of 80 kHz, and what it does to
-R_s, R_p and C_p of a dry and a damp fingertip at 60 dB (converter without rounding):
-
-    RELTOL    deviation    elements    steps per period
-    1e-6      1.1e-4       0.054 %     10 000
-    1e-7      2.5e-5       0.014 %     13 000
-    1e-8      6.2e-6       0.003 %     22 000     22 circuits, elements spread by 30 %
-    1e-9      1.3e-6                   38 000     one of them ends with "timestep too small"
-
-A 16-bit converter rounds a few of a hundred samples to the other code, which moves the elements by
-a tenth of their standard errors at 60 dB, for this reason alone.
+ngspice chooses its own steps, which RELTOL bounds. With 1e-8 the largest deviation from
+`Scene.waveform` is 6.2e-6 of the peak, after the anti-alias filter of 80 kHz, which moves R_s, R_p
+and C_p of a dry and a damp fingertip at 60 dB by 0.003 % (22 circuits, elements spread by 30 %,
+converter without rounding). With 1e-9 one of them ends with "timestep too small". A 16-bit
+converter rounds a few of a hundred samples to the other code, which moves the elements by a tenth
+of their standard errors.
 """
 
 import functools
@@ -68,11 +62,6 @@ def netlist(driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_
     The windings are an ideal transformer 1:n between m and w, with the leakage, magnetising and
     loss elements of each side around it.
 
-    Args:
-        driver: The pulse transformer.
-        load: Open, a resistor, skin, or a circuit.
-        pulse_rate: Pulses per second [Hz].
-
     Raises:
         ValueError: ngspice cannot have this load or this pulse.
     """
@@ -88,13 +77,7 @@ def netlist(driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_
 
 
 def single_pulse(driver: TransformerDriver, load: Impedance, duration: float) -> str:
-    """The same circuit from rest, with one pulse; the current through the load is saved as well.
-
-    Args:
-        driver: The pulse transformer.
-        load: A resistor or skin.
-        duration: Time that is solved [s].
-    """
+    """The same circuit from rest, with one pulse; the current through the load is saved as well."""
     behind = (line.replace(" o ", " load ", 1) for line in _load(load))
     lines = [*_circuit(driver, 10 * duration), "Vload o load 0", *behind, OPTIONS]
     run = _text(LONGEST_STEP, duration, 0.0, LONGEST_STEP)
@@ -137,11 +120,7 @@ def _text(*numbers: float) -> str:
 
 
 def record(scene: Scene, seed: int) -> etid.Study:
-    """Make the recordings of a scene from waveforms of ngspice.
-
-    Args:
-        scene: Driver, loads and recorder.
-        seed: Seed of noise, delays and offsets, with the draws of `scene.simulate(seed)`.
+    """Make the recordings of a scene from waveforms of ngspice, with the draws of its `simulate`.
 
     Raises:
         NgspiceError: ngspice is not installed or failed.
@@ -157,14 +136,9 @@ def record(scene: Scene, seed: int) -> etid.Study:
 
 @functools.lru_cache(maxsize=256)
 def harmonics(netlist: str, pulse_rate: float, count: int) -> Complex[np.ndarray, " count"]:
-    """Fourier coefficients [V] of the steady state at the first `count` harmonics.
+    """Fourier coefficients [V] of the steady state at the first harmonics.
 
     The steps of ngspice are uneven: a cubic spline through them is sampled evenly.
-
-    Args:
-        netlist: What ngspice solves.
-        pulse_rate: Pulses per second [Hz].
-        count: Number of harmonics.
 
     Raises:
         NgspiceError: As `solve`; or the last two periods differ, so that this is no steady state.
@@ -185,9 +159,7 @@ def harmonics(netlist: str, pulse_rate: float, count: int) -> Complex[np.ndarray
 
 
 def solve(netlist: str) -> Float[np.ndarray, "row step"]:
-    """Times [s] and what is saved, such as v(o) [V], at the steps of ngspice.
-
-    They come from `CACHE` if known.
+    """Times [s] and what is saved, such as v(o) [V], at the steps of ngspice, or from `CACHE`.
 
     Raises:
         NgspiceError: ngspice is not installed or failed.

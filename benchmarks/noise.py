@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 import etid
 from benchmarks.coverage import identified, targets
-from benchmarks.disturbances import Hum
+from benchmarks.disturbances import Added, hum
 from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import all_records, both, out, undisturbed
@@ -45,17 +45,9 @@ class Flicker:
         return np.fft.irfft(white, time.size)
 
 
-@dataclasses.dataclass(frozen=True)
-class White:
-    """More white noise."""
-
-    sigma: float  # standard deviation of a sample [V at the converter]
-
-    def __call__(
-        self, time: Float[np.ndarray, " time"], rng: np.random.Generator
-    ) -> Float[np.ndarray, " time"]:
-        """Volts at these times [s]."""
-        return self.sigma * rng.standard_normal(time.size)
+def white(sigma: float) -> Added:
+    """More white noise, of this standard deviation [V at the converter]."""
+    return lambda time, rng: sigma * rng.standard_normal(time.size)
 
 
 KINDS: Mapping[str, Callable[[Record], Record]] = {
@@ -63,9 +55,9 @@ KINDS: Mapping[str, Callable[[Record], Record]] = {
     "1/f, 1 kHz": lambda of: both(added=(Flicker(of.sigma, 1e3),))(of),
     "1/f, 10 kHz": lambda of: both(added=(Flicker(of.sigma, 1e4),))(of),
     "1/f, 10 kHz, V_out only": lambda of: out(added=(Flicker(of.sigma, 1e4),))(of),
-    "V_out three times as loud": lambda of: out(added=(White(8**0.5 * of.sigma),))(of),
-    "hum of 50 Hz": lambda of: both(added=(Hum(50.0, HUM),))(of),
-    "hum of 60 Hz": lambda of: both(added=(Hum(60.0, HUM),))(of),
+    "V_out three times as loud": lambda of: out(added=(white(8**0.5 * of.sigma),))(of),
+    "hum of 50 Hz": lambda of: both(added=(hum(50.0, HUM),))(of),
+    "hum of 60 Hz": lambda of: both(added=(hum(60.0, HUM),))(of),
 }
 
 

@@ -3,8 +3,7 @@
 One pinned core, samples in ordinary arrays, as many pulses as asked for after a warm-up. The pulses
 differ in noise, trigger delay and sampling phase. filterpy's extended Kalman filter tracks the same
 pulses with the same model in the same run, in an environment of its own (`.rivals`). Then follow
-false alarms and the detection of wet skin (`benchmarks.online_alarms`). The table is `online.csv`.
-A missed target makes the command end with 1.
+false alarms and the detection of wet skin (`benchmarks.online_alarms`).
 """
 
 import argparse
@@ -18,8 +17,8 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
-from benchmarks.machine import RESULTS, write_csv
-from benchmarks.online_alarms import LIFTED, LOADS, SOON, Fingertip, alarms
+from benchmarks.machine import RESULTS
+from benchmarks.online_alarms import LOADS, SOON, Fingertip, alarms
 from benchmarks.rivals import RivalError, exchange, make
 from benchmarks.runner import Target, at_least, at_most, option, report
 from etid.online.state import TrackerState
@@ -45,7 +44,6 @@ CHANGE = 1e-3  # random walk that the tracker expects in the ticks [1/√pulse]
 OPTIONS = (
     option("--electrodes", default=98),
     option("--ticks", default=2000),
-    option("--lifted", default=0, help="electrodes that touch nothing"),
     option("--hours", default=4.0, help="electrode hours of false alarms; 0 for none"),
     option("-o", "--output", type=pathlib.Path, default=RESULTS / "online.csv"),
 )
@@ -54,14 +52,10 @@ OPTIONS = (
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table and write it; whether all targets are met."""
     electrodes, hours = arguments.electrodes, arguments.hours
-    found = list(ticks(electrodes, arguments.lifted, arguments.ticks))
+    found = list(ticks(electrodes, arguments.ticks))
     for snr_db in NOISES if hours > 0 else ():
         found += tests(electrodes, snr_db, hours)
-    rows = [
-        {"quantity": of.name, "value": of.value, "least": of.least, "most": of.most} for of in found
-    ]
-    write_csv(arguments.output, rows)
-    return report(found)
+    return report(found, arguments.output)
 
 
 def named(name: str, value: float, of: str = "") -> Target:
@@ -69,9 +63,9 @@ def named(name: str, value: float, of: str = "") -> Target:
     return Target(f"{of}{name}", value, *TARGETS.get(name, (np.nan, np.nan)))
 
 
-def ticks(electrodes: int, lifted: int, number: int) -> Iterator[Target]:
+def ticks(electrodes: int, number: int) -> Iterator[Target]:
     """Times of a tick, and of filterpy."""
-    tracker, pulses = problem(electrodes, lifted)
+    tracker, pulses = problem(electrodes)
     state, ratios, busy = timed(tracker, pulses, number)
     print(f"{electrodes} electrodes, {len(ratios)} ticks: {tracker.read(state).counts()}")
     for name, percent in (("median", 50), ("p99", 99), ("worst", 100)):
@@ -119,10 +113,9 @@ def timed(
     return state, wall, busy
 
 
-def problem(electrodes: int, lifted: int) -> tuple[etid.Tracker, np.ndarray]:
+def problem(electrodes: int) -> tuple[etid.Tracker, np.ndarray]:
     """A tracker, and pulses for it (pulse, electrode, sample)."""
     display, loads = Fingertip(electrodes, NOISES[0], CHANGE), np.arange(electrodes) % len(LOADS)
-    loads[:lifted] = LIFTED
     return display.tracker, np.stack([*display.pulses(loads, KINDS)])
 
 
@@ -133,13 +126,8 @@ def seconds_of_filterpy(
 ) -> float:
     """Median processor time of filterpy for one pulse at all electrodes, the bands apart [s].
 
-    Args:
-        tracker: Tracker of `SkinRC` whose model is used.
-        pulses: Windows of the first pulses after a start [V].
-        logs: Logarithms of the elements that the tracker has found.
-
-    Raises:
-        RivalError: filterpy cannot be installed or run.
+    Its filters start near the logarithms that the tracker has found; a `RivalError` if there is no
+    filterpy.
     """
     missing = make(ENVIRONMENT)
     if missing:

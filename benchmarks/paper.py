@@ -4,11 +4,8 @@ Five laboratories make the same recordings. `good` has 60 dB and one clock. Each
 has one thing worse: white noise of 40 or of 30 dB, or trigger delays of 200 ns (rms) in every
 record, the calibration included. `both`, with 40 dB and 200 ns, is where the paper's method errs as
 much as the paper prints. The tables put the two causes apart: noise biases Steiglitz-McBride, the
-same in every trial; delays spread its trials.
-
-A study is made several times, each with a calibration of its own. `--source spice` takes its
-waveforms from ngspice. `table_4.svg` shows error and scatter of the built circuit by cause; `make
-demo` makes all tables and figures of the paper.
+same in every trial; delays spread its trials. A study is made several times, each with a
+calibration of its own. `table_4.svg` shows error and scatter of the built circuit by cause.
 
 Rows are tidy: one per laboratory, method and element, beside what the paper prints. Errors, spreads
 and scatters are in per cent. A fit without a circuit (an estimate that is negative or complex)
@@ -29,11 +26,9 @@ import etid
 from benchmarks import charts
 from benchmarks.ladder import SOURCES
 from benchmarks.machine import write_csv
-from benchmarks.runner import QUICK, Target, at_most, option, report
-from etid.circuits.display import DISPLAY
+from benchmarks.runner import QUICK, Target, at_most, option, report, show
 from etid.paper.tables import LABORATORIES as ENDS
 from etid.paper.tables import METHODS, ORDER, Outcome, Truth, errors, identify, resistor_errors
-from etid.report.html import Section, Table, number
 from etid.simulation import published
 from etid.simulation.scenes import Scene
 
@@ -55,21 +50,6 @@ TARGETS = {
     "Table I at 60 dB, largest rms error of a resistor [%]": at_most(0.1),
     "Table IV at 30 dB, error of the mean in standard errors": at_most(2.0),
 }
-TABLES = (
-    (
-        "Table I: errors of five resistors [%]",
-        "Mean over the studies, and standard deviation between them.",
-        ("r", "paper_error", "error", "spread", "circuits", "fits"),
-    ),
-    (
-        "Table IV: the built circuit",
-        "Mean error and scatter between the trials of a study [%], and standard deviation between "
-        "the means of the studies, each with its own calibration. The paper tells no sign.",
-        ("element", "paper_error", "paper_scatter", "error", "scatter", "between", "rrse",
-         "circuits", "successful", "fits"),
-    ),
-)  # fmt: skip
-
 OPTIONS = (
     QUICK,
     option("--source", default="simulated", choices=SOURCES),
@@ -97,14 +77,6 @@ def _sd(values: np.ndarray) -> float:
 def _mean(values: Iterable[float]) -> float:
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else np.nan
-
-
-def _counts(every: Sequence[etid.Fits]) -> Row:
-    return {
-        "successful": sum(len(fits.successful()) for fits in every),
-        "circuits": sum(len(_with_circuit(fits)) for fits in every),
-        "fits": sum(map(len, every)),
-    }
 
 
 def table_1(groups: Groups) -> list[Row]:
@@ -143,7 +115,12 @@ def table_4(groups: Groups, truth: Truth) -> list[Row]:
             row["scatter"] = float(np.sqrt(_mean(errors.var(ddof=1) for errors in found)))
             row["stderr"] = _mean(_stderr_of_mean(fits, truth, i) for fits in some)
             row["rrse"] = 100 * float(np.median([np.median(fits.rrse) for fits in every]))
-            rows.append({**row, **_counts(every), "studies": len(some)})
+            counts = {
+                "successful": sum(len(fits.successful()) for fits in every),
+                "circuits": sum(len(_with_circuit(fits)) for fits in every),
+                "fits": sum(map(len, every)),
+            }
+            rows.append({**row, **counts, "studies": len(some)})
     return sorted(rows, key=lambda row: ORDER.index(row["element"]))
 
 
@@ -152,23 +129,6 @@ def _stderr_of_mean(fits: etid.Fits, truth: Truth, i: int) -> float:
     known = truth[str(fits.labels["path"][0])][etid.SkinRC.names()[i]]
     total, shared = (np.asarray(cov)[:, i, i].mean() for cov in (fits.cov, fits.fit.shared_cov))
     return float(100 / known * np.sqrt(shared + (total - shared) / len(fits)))
-
-
-def show(rows: Sequence[Row], columns: Sequence[str]) -> Table:
-    """A table for the terminal: the laboratory, the method, and these columns of the rows."""
-    heads = ("laboratory", "method", *columns)
-    return Table(heads, tuple(tuple(_cell(name, row) for name in heads) for row in rows))
-
-
-def _cell(name: str, row: Row) -> str:
-    """One cell; resistances in the unit in which circuits are printed."""
-    value = row[name]
-    if not isinstance(value, float):
-        return str(value)
-    if name == "r":
-        scale, symbol = DISPLAY["ohm"]
-        return f"{value / scale:.4g} {symbol}"
-    return number(value)
 
 
 def targets(first: Sequence[Row], fourth: Sequence[Row]) -> Iterator[Target]:
@@ -244,9 +204,10 @@ def main(arguments: argparse.Namespace) -> bool:
         for method in METHODS:
             groups.setdefault((laboratory, method), []).append(identify(laboratory, study, method))
     first, fourth = table_1(groups), table_4(groups, truth)
-    for (title, text, columns), which, rows in zip(TABLES, (1, 4), (first, fourth), strict=True):
+    for which, rows in (1, first), (4, fourth):
         write_csv(folder / f"table_{which}.csv", [{"source": source, **row} for row in rows])
-        print(f"\n{Section(title, text, (show(rows, columns),))}")
+        for row in rows:
+            show({"table": which, **row})
     print(f"\n{textwrap.fill(cause(fourth), 100)}\n")
     draw(fourth, folder / "table_4.svg")
     print(f"Tables and figure: {folder.resolve()}")

@@ -1,12 +1,10 @@
-"""What others take for a fit: SciPy, stock optimistix, jaxopt; and trials behind one driver for it.
+"""What others take for a fit: SciPy and stock optimistix; and trials behind one driver for it.
 
-All get the same residual and the same start. The two solvers in JAX, which have no filters, run as
-their users run them, `vmap` over lanes, `SIDE_BY_SIDE` at a time. SciPy goes from lane to lane with
-residual and Jacobian in NumPy, and is measured on a few of them.
+All get the same residual and the same start. optimistix, which has no filters, runs as its users
+run it, `vmap` over lanes, `SIDE_BY_SIDE` at a time. SciPy goes from lane to lane with residual and
+Jacobian in NumPy, and is measured on a few of them.
 """
 
-import importlib
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -73,12 +71,6 @@ class Problem(NamedTuple):
     records: list[etid.Recording]  # the trials
     lanes: Harmonics  # their harmonics, stacked
     known: GivenDriver  # what the calibration tells at these
-
-    def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Both voltages of all trials, stacked."""
-        voltages = [(record.v_th, record.v_out) for record in self.records]
-        v_th, v_out = (np.stack(column) for column in zip(*voltages, strict=True))
-        return v_th, v_out
 
     def load(self, one: Any) -> Load:
         """A lane with Z_th as it is; calling it gives the terms of elements and delay."""
@@ -223,31 +215,15 @@ def harmonic_steiglitz_mcbride(of: Problem, iterations: int) -> Run:
 
 def one_fit(of: Problem) -> dict[str, Callable[[Any], Any]]:
     """Elements and delay of one lane, by each solver in JAX."""
-    start = jnp.asarray(START)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it is no longer maintained, and says so when imported
-        jaxopt = importlib.import_module("jaxopt")
+    start, settings = jnp.asarray(START), {"max_steps": MAX_STEPS, "throw": False}
 
-    def by(solver):
-        settings = {"max_steps": MAX_STEPS, "throw": False}
+    def by(solver: Any) -> Callable[[Any], Any]:
         return lambda one: (
             optx.least_squares(terms, solver, start, args=of.load(one), **settings).value
         )
 
-    rival = jaxopt.LevenbergMarquardt(
-        terms,
-        maxiter=MAX_STEPS,
-        stop_criterion="madsen-nielsen",
-        xtol=1e-8,
-        gtol=1e-8,
-        solver="cholesky",
-        materialize_jac=True,
-    )
-    return {
-        "ours": by(WELL),
-        "optimistix": by(optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)),
-        "jaxopt": lambda one: rival.run(start, of.load(one)).params,
-    }
+    stock = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+    return {"ours": by(WELL), "optimistix": by(stock)}
 
 
 def _minpack(value: Callable, slope: Any) -> np.ndarray:
@@ -280,7 +256,6 @@ def solvers(of: Problem) -> dict[str, Run]:
         "ours": _each(by["ours"], lanes),
         "scipy": _looped(_scipy_fit(of), lanes),
         "optimistix": _vmapped(by["optimistix"], lanes),
-        "jaxopt": _vmapped(by["jaxopt"], lanes),
     }
 
 

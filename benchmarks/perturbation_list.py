@@ -14,46 +14,20 @@ from collections.abc import Mapping
 
 import scipy.stats
 
+from benchmarks import perturbed_study as lab
 from benchmarks import visibility
-from benchmarks.disturbances import Hum, Offset, Spike
+from benchmarks.disturbances import Leaky, hum, offset, spike
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import LOADS
-from benchmarks.perturbed_study import (
-    REFERENCE,
-    Change,
-    all_records,
-    both,
-    calibrations,
-    changing,
-    coherent,
-    crosstalk,
-    late,
-    leaking,
-    longer,
-    louder,
-    nonlinear,
-    on_edge,
-    out,
-    parts,
-    pink,
-    pulses,
-    record,
-    second_resistor,
-    shunted,
-    single,
-    skin_is,
-    tail,
-    th,
-    trials,
-)
+from benchmarks.perturbed_study import Change, all_records, both, calibrations, out, th, trials
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 
 UNDISTURBED: Mapping[str, Change] = {
     "base": lambda study: study,
     "base_no_delay": lambda study: all_records(both(delay=0.0))(study),
-    "base_six_periods": longer(),
-    "base_two_resistors": second_resistor(1.0),
-    "base_whole_samples_per_period": coherent(),
+    "base_six_periods": lab.longer(),
+    "base_two_resistors": lab.second_resistor(1.0),
+    "base_whole_samples_per_period": lab.coherent(),
 }
 """Studies in which all is well: hardly any of them may be refused."""
 
@@ -61,55 +35,55 @@ UNDISTURBED: Mapping[str, Change] = {
 def _hum(amplitude: float) -> dict[str, Change]:
     said = f"{amplitude:g}V"
     return {
-        f"hum60_{said}_all": all_records(both(added=(Hum(60.0, amplitude),))),
-        f"hum60_{said}_out_skin_only": trials(out(added=(Hum(60.0, amplitude),))),
-        f"hum50_{said}_all": all_records(both(added=(Hum(50.0, amplitude),))),
+        f"hum60_{said}_all": all_records(both(added=(hum(60.0, amplitude),))),
+        f"hum60_{said}_out_skin_only": trials(out(added=(hum(60.0, amplitude),))),
+        f"hum50_{said}_all": all_records(both(added=(hum(50.0, amplitude),))),
     }
 
 
-_LOCKED = Hum(60.0, 0.02, phase=0.2)
+_LOCKED = hum(60.0, 0.02, phase=0.2)
 NUISANCES: Mapping[str, Change] = {
     **_hum(0.002),
     **_hum(0.02),
     **_hum(0.1),
-    "hum60h_100mV_all": all_records(both(added=(Hum(60.0, 0.1, (2, 3, 5)),))),
+    "hum60h_100mV_all": all_records(both(added=(hum(60.0, 0.1, (2, 3, 5)),))),
     "hum60_20mV_phase_locked_th_and_out": all_records(both(added=(_LOCKED,))),
-    "dc_0.5V_all": all_records(both(added=(Offset(0.5),))),
-    "wander1Hz_50mV": all_records(both(added=(Hum(1.0, 0.05),))),
-    "wander1Hz_500mV": all_records(both(added=(Hum(1.0, 0.5),))),
-    "spike_0.5V_5ms_out": trials(out(added=(Spike(0.5, 5e-3),))),
-    "spike_0.1V_5ms_out": trials(out(added=(Spike(0.1, 5e-3),))),
-    "spike_1V_5ms_out": trials(out(added=(Spike(1.0, 5e-3),))),
-    "spike_1V_0.1ms_out": trials(out(added=(Spike(1.0, 1e-4),))),
-    "spike_1V_5ms_out_six_periods": longer(trials(out(added=(Spike(1.0, 5e-3),)))),
-    "spike_0.1V_5ms_th_six_periods": longer(trials(th(added=(Spike(0.1, 5e-3),)))),
-    "jump_0.5V_5ms_out": trials(out(added=(Spike(0.5, 5e-3, rectangular=True),))),
-    "jump_1V_5ms_out": trials(out(added=(Spike(1.0, 5e-3, rectangular=True),))),
-    "tail_5mV_5ms": all_records(tail(5e-3, 5e-3)),
-    "tail_5mV_5ms_skin": trials(tail(5e-3, 5e-3)),
-    "crosstalk_1%_neighbour": trials(crosstalk(4e-3)),
-    "crosstalk_1%_unloaded": trials(crosstalk(0.0)),
-    "coloured_noise_1/f": all_records(pink),
+    "dc_0.5V_all": all_records(both(added=(offset(0.5),))),
+    "wander1Hz_50mV": all_records(both(added=(hum(1.0, 0.05),))),
+    "wander1Hz_500mV": all_records(both(added=(hum(1.0, 0.5),))),
+    "spike_0.5V_5ms_out": trials(out(added=(spike(0.5, 5e-3),))),
+    "spike_0.1V_5ms_out": trials(out(added=(spike(0.1, 5e-3),))),
+    "spike_1V_5ms_out": trials(out(added=(spike(1.0, 5e-3),))),
+    "spike_1V_0.1ms_out": trials(out(added=(spike(1.0, 1e-4),))),
+    "spike_1V_5ms_out_six_periods": lab.longer(trials(out(added=(spike(1.0, 5e-3),)))),
+    "spike_0.1V_5ms_th_six_periods": lab.longer(trials(th(added=(spike(0.1, 5e-3),)))),
+    "jump_0.5V_5ms_out": trials(out(added=(spike(0.5, 5e-3, rectangular=True),))),
+    "jump_1V_5ms_out": trials(out(added=(spike(1.0, 5e-3, rectangular=True),))),
+    "tail_5mV_5ms": all_records(lab.tail(5e-3, 5e-3)),
+    "tail_5mV_5ms_skin": trials(lab.tail(5e-3, 5e-3)),
+    "crosstalk_1%_neighbour": trials(lab.crosstalk(4e-3)),
+    "crosstalk_1%_unloaded": trials(lab.crosstalk(0.0)),
+    "coloured_noise_1/f": all_records(lab.pink),
 }
 
 CONVERTERS: Mapping[str, Change] = {
-    "bits8_10V": all_records(record(bits=8)),
-    "bits8_4V": all_records(record(bits=8, full_scale=4.0)),
-    "bits8_4V_nonoise": all_records(record(bits=8, full_scale=4.0, sigma=0.0)),
-    "bits8_4V_float": all_records(record(bits=8, full_scale=4.0, codes=False)),
-    "bits10_10V_nonoise_float": all_records(record(bits=10, sigma=0.0, codes=False)),
-    "whole_samples_per_period_unfiltered": coherent(antialias=4.0),
+    "bits8_10V": all_records(lab.record(bits=8)),
+    "bits8_4V": all_records(lab.record(bits=8, full_scale=4.0)),
+    "bits8_4V_nonoise": all_records(lab.record(bits=8, full_scale=4.0, sigma=0.0)),
+    "bits8_4V_float": all_records(lab.record(bits=8, full_scale=4.0, codes=False)),
+    "bits10_10V_nonoise_float": all_records(lab.record(bits=10, sigma=0.0, codes=False)),
+    "whole_samples_per_period_unfiltered": lab.coherent(antialias=4.0),
     **{
         f"bits{bits}_10V_float_no_range": all_records(
-            record(bits=bits, codes=False, told={"adc_range": None})
+            lab.record(bits=bits, codes=False, told={"adc_range": None})
         )
         for bits in (12, 14)
     },
-    "three_digits": all_records(record(digits=3, told={"adc_range": None})),
+    "three_digits": all_records(lab.record(digits=3, told={"adc_range": None})),
     "out_a_tenth_skin_only": trials(out(gain=0.1)),
     "lowpass_80kHz_skin": trials(out(lowpass=80e3)),
-    "lowpass_80kHz_skin_one_period": single(trials(out(lowpass=80e3))),
-    "capacitance_5pF_skin": trials(shunted(5e-12)),
+    "lowpass_80kHz_skin_one_period": lab.single(trials(out(lowpass=80e3))),
+    "capacitance_5pF_skin": trials(lab.shunted(5e-12)),
     "adc_jitter_500ns": all_records(both(sampling_jitter=500e-9)),
     "slow_adc_filter_out": all_records(out(lowpass=30e3)),
     "slow_adc_filter_out_skin_only": trials(out(lowpass=30e3)),
@@ -121,24 +95,24 @@ CONVERTERS: Mapping[str, Change] = {
     "polarity_out": all_records(out(gain=-1.0)),
     "polarity_out_skin_only": trials(out(gain=-1.0)),
     "polarity_both": all_records(both(gain=-1.0)),
-    "swapped": all_records(record(swapped=True)),
-    "swapped_skin_only": trials(record(swapped=True)),
+    "swapped": all_records(lab.record(swapped=True)),
+    "swapped_skin_only": trials(lab.record(swapped=True)),
 }
 
 _MISSING, _DOUBLE = ((0, 1.0), (2, 1.0)), ((0, 1.0), (1, 1.0), (1.5, 1.0), (2, 1.0))
 CLOCKS: Mapping[str, Change] = {
-    "missing_pulse_out": trials(out(**pulses(*_MISSING))),
-    "missing_pulse_both": trials(both(**pulses(*_MISSING))),
-    "double_pulse_out": trials(out(**pulses(*_DOUBLE))),
-    "double_pulse_both": trials(both(**pulses(*_DOUBLE))),
+    "missing_pulse_out": trials(out(**lab.pulses(*_MISSING))),
+    "missing_pulse_both": trials(both(**lab.pulses(*_MISSING))),
+    "double_pulse_out": trials(out(**lab.pulses(*_DOUBLE))),
+    "double_pulse_both": trials(both(**lab.pulses(*_DOUBLE))),
     **{
         f"{fault}_sample_{name}": trials(change(**{fault: 5000}))
         for fault in ("lost", "doubled")
         for name, change in (("out", out), ("th", th))
     },
     "lost_sample_in_pulse_out": trials(out(lost=3420)),
-    "lost_sample_out_six_periods": longer(trials(out(lost=12_000))),
-    "edge_at_the_joint_pulses_jitter": trials(on_edge),
+    "lost_sample_out_six_periods": lab.longer(trials(out(lost=12_000))),
+    "edge_at_the_joint_pulses_jitter": trials(lab.on_edge),
     "clock_out_20ppm": all_records(out(pulse_rate=60.0012)),
     "clock_out_20ppm_skin": trials(out(pulse_rate=60.0012)),
     "rate_0.1%_all": all_records(both(pulse_rate=60.06)),
@@ -146,71 +120,65 @@ CLOCKS: Mapping[str, Change] = {
     "rate_0.1%_skin_only": trials(both(pulse_rate=60.06)),
     "rate_1%_all": all_records(both(pulse_rate=60.6)),
     **{
-        f"delay_{samples:g}_samples_out": all_records(late(samples)) for samples in (1.5, 5.0, 50.0)
+        f"delay_{samples:g}_samples_out": all_records(lab.late(samples))
+        for samples in (1.5, 5.0, 50.0)
     },
     **{
-        f"delay_{samples:g}_samples_skin": trials(late(samples))
+        f"delay_{samples:g}_samples_skin": trials(lab.late(samples))
         for samples in (0.9, 1.5, 5.0, 50.0, 100.0)
     },
     **{
-        f"says_{rate // 1000}kHz": all_records(record(told={"sample_rate": float(rate)}))
+        f"says_{rate // 1000}kHz": all_records(lab.record(told={"sample_rate": float(rate)}))
         for rate in (50_000, 100_000, 250_000, 400_000)
     },
-    "says_100kHz_six_periods": longer(all_records(record(told={"sample_rate": 100e3}))),
+    "says_100kHz_six_periods": lab.longer(all_records(lab.record(told={"sample_rate": 100e3}))),
     **{
-        f"says_{rate}Hz": all_records(record(told={"pulse_rate": float(rate)}))
+        f"says_{rate}Hz": all_records(lab.record(told={"pulse_rate": float(rate)}))
         for rate in (20, 30, 50, 90, 120, 180)
     },
-    "says_1/60Hz": all_records(record(told={"pulse_rate": 1 / 60})),
+    "says_1/60Hz": all_records(lab.record(told={"pulse_rate": 1 / 60})),
 }
 
 SKINS: Mapping[str, Change] = {
     **{
-        f"{name}_{kind}_{fall:g}": changing(element, fall, kind == "step")
-        for name, element, kind, fall in (
-            ("rp", "r_p", "linear", 0.05),
-            ("rp", "r_p", "step", 0.05),
-            ("rs", "r_s", "linear", 0.05),
-            ("rs", "r_s", "step", 0.05),
-            ("rp", "r_p", "linear", 0.2),
-            ("rp", "r_p", "step", 0.2),
-            ("rs", "r_s", "linear", 0.2),
-            ("rs", "r_s", "step", 0.2),
-            ("cp", "c_p", "linear", 0.05),
-        )
+        f"{name}_{kind}_{fall:g}": lab.changing(element, fall, kind == "step")
+        for fall in (0.05, 0.2)
+        for name, element in (("rp", "r_p"), ("rs", "r_s"))
+        for kind in ("linear", "step")
     },
-    "rp_linear_0.05_six_periods": longer(changing("r_p", 0.05, False, 6)),
-    "rs_step_0.2_six_periods": longer(changing("r_s", 0.2, True, 6)),
-    "Rp_nonlinear_0.2": nonlinear(0.2),
-    "Rp_nonlinear_0.4": nonlinear(0.4),
-    "cole_alpha0.8": skin_is(functools.partial(Cole, alpha=0.8), words=True),
-    "two_rc_mid": skin_is(functools.partial(TwoLayers, share=0.3), words=True),
-    "leak_100Rp": skin_is(leaking),
+    "cp_linear_0.05": lab.changing("c_p", 0.05, False),
+    "rp_linear_0.05_six_periods": lab.longer(lab.changing("r_p", 0.05, False, 6)),
+    "rs_step_0.2_six_periods": lab.longer(lab.changing("r_s", 0.2, True, 6)),
+    "Rp_nonlinear_0.2": lab.nonlinear(0.2),
+    "Rp_nonlinear_0.4": lab.nonlinear(0.4),
+    "cole_alpha0.8": lab.skin_is(functools.partial(Cole, alpha=0.8), words=True),
+    "two_rc_mid": lab.skin_is(functools.partial(TwoLayers, share=0.3), words=True),
+    "leak_100Rp": lab.skin_is(lambda skin: Leaky(skin, 100 * skin.r_p)),
 }
 
 _ALL_PARTS = ("r_protection", "r_secondary", "l_secondary", "l_magnetising", "r_source")
 DRIVERS: Mapping[str, Change] = {
-    "driver_Rprot_x1.05": trials(parts(r_protection=1.05)),
-    "driver_Rprot_x1.2": trials(parts(r_protection=1.2)),
-    "driver_Rsw_x1.2": trials(parts(r_secondary=1.2)),
-    "driver_Lls_x1.05": trials(parts(l_primary=1.05, l_secondary=1.05)),
-    "driver_Lls_x1.2": trials(parts(l_primary=1.2, l_secondary=1.2)),
-    "driver_Lm_x1.2": trials(parts(l_magnetising=1.2)),
-    "driver_Rsrc_x1.2": trials(parts(r_source=1.2)),
-    "driver_Csec_x1.1": trials(parts(c_secondary=1.1)),
-    "driver_Ccab_x1.1": trials(parts(c_cable=1.1)),
-    "driver_all_5%": trials(parts(**dict.fromkeys(_ALL_PARTS, 1.05))),
-    "driver_Vp_+2%_out_vs_th": trials(louder(1.02)),
-    "driver_Vp_-2%_out_vs_th": trials(louder(0.98)),
+    "driver_Rprot_x1.05": trials(lab.parts(r_protection=1.05)),
+    "driver_Rprot_x1.2": trials(lab.parts(r_protection=1.2)),
+    "driver_Rsw_x1.2": trials(lab.parts(r_secondary=1.2)),
+    "driver_Lls_x1.05": trials(lab.parts(l_primary=1.05, l_secondary=1.05)),
+    "driver_Lls_x1.2": trials(lab.parts(l_primary=1.2, l_secondary=1.2)),
+    "driver_Lm_x1.2": trials(lab.parts(l_magnetising=1.2)),
+    "driver_Rsrc_x1.2": trials(lab.parts(r_source=1.2)),
+    "driver_Csec_x1.1": trials(lab.parts(c_secondary=1.1)),
+    "driver_Ccab_x1.1": trials(lab.parts(c_cable=1.1)),
+    "driver_all_5%": trials(lab.parts(**dict.fromkeys(_ALL_PARTS, 1.05))),
+    "driver_Vp_+2%_out_vs_th": trials(lab.louder(1.02)),
+    "driver_Vp_-2%_out_vs_th": trials(lab.louder(0.98)),
 }
 
 CALIBRATIONS: Mapping[str, Change] = {
-    "driver_Rload_wrong_5%": calibrations(out(loads=(ResistorLoad(1.05 * REFERENCE),))),
-    "two_resistors_one_wrong_5%": second_resistor(1.05),
-    "says_98.8ohm": calibrations(record(told={"r_load": REFERENCE / 1000})),
-    "says_1mohm": calibrations(record(told={"r_load": 1e-3})),
-    "says_1Tohm": calibrations(record(told={"r_load": 1e12})),
-    "calibration_v_out_is_v_th": calibrations(record(copied=True)),
+    "driver_Rload_wrong_5%": calibrations(out(loads=(ResistorLoad(1.05 * lab.REFERENCE),))),
+    "two_resistors_one_wrong_5%": lab.second_resistor(1.05),
+    "says_98.8ohm": calibrations(lab.record(told={"r_load": lab.REFERENCE / 1000})),
+    "says_1mohm": calibrations(lab.record(told={"r_load": 1e-3})),
+    "says_1Tohm": calibrations(lab.record(told={"r_load": 1e12})),
+    "calibration_v_out_is_v_th": calibrations(lab.record(copied=True)),
     "calibration_unloaded": calibrations(out(loads=(ResistorLoad(1e15),))),
     "calibration_is_skin": calibrations(out(loads=(LOADS["dry"],))),
 }
@@ -230,21 +198,12 @@ PERTURBATIONS: Mapping[str, Change] = {
 class Invisible:
     """Why a perturbation is not seen."""
 
-    why: str  # by how much the elements are wrong, and the reason
-    # of the records. As many silent answers are excused as the best test would miss; None if no
-    # test can see it at all
+    # as many silent answers are excused as the best test of it would miss; all if there is no test
     change: visibility.Change | None = None
     snr_db: float = math.inf  # largest at which it is so [dB]
 
     def excuses(self, path: str, snr_db: float, silent: int, answers: int) -> bool:
-        """Whether so many silent answers are as many as the best test would give, or less.
-
-        Args:
-            path: Of the skin.
-            snr_db: Of the noise [dB].
-            silent: Answers that are silent.
-            answers: All of them, each behind a driver of its own.
-        """
+        """Whether the best test, too, would be silent so often, behind the skin of this path."""
         if self.change is None:
             return snr_db <= self.snr_db
         missed = visibility.missed(LOADS[path], snr_db, self.change)
@@ -252,58 +211,24 @@ class Invisible:
 
 
 CHANCE = 0.01  # probability that the best test, too, is silent so often
-_BEST = "%s: the best test would see it, at 40 dB, at %s standard deviations behind dry and %s "
-_BEST += "behind damp skin"
 INVISIBLE: Mapping[str, Invisible] = {
-    "driver_Rload_wrong_5%": Invisible(
-        "up to 5 %: one calibration shows ratios to its resistor only; every resistance and 1/C_p "
-        "is wrong by the same 5 %"
-    ),
-    "leak_100Rp": Invisible(
-        "up to 1.7 %: R_s + R_p ‖ C_p with a resistor across it has the impedance of another "
-        "R_s + R_p ‖ C_p at every frequency"
-    ),
-    "calibration_is_skin": Invisible(
-        "all: one calibration shows ratios to its load only, and another driver with a resistor "
-        "would give the same records",
-        snr_db=40.0,
-    ),
-    **{
-        f"gain_out_{sign}1%_all": Invisible(
-            _BEST % ("R_p up to 13 %", 3.2, 4.3), visibility.gain(0.01, True)
-        )
-        for sign in "+-"
-    },
-    **{
-        f"gain_out_{sign}1%_skin": Invisible(
-            _BEST % ("R_p of damp skin up to 6 %", 5.9, 1.3), visibility.gain(0.01, False)
-        )
-        for sign in "+-"
-    },
-    "crosstalk_1%_unloaded": Invisible(
-        _BEST % ("R_p of damp skin up to 6 %", 5.9, 1.3), visibility.crosstalk(0.01)
-    ),
-    **{
-        f"driver_Vp_{sign}2%_out_vs_th": Invisible(
-            _BEST % ("R_p of damp skin up to 8 %", 11.8, 2.7), visibility.gain(0.02, False)
-        )
-        for sign in "+-"
-    },
-    "slow_adc_filter_out_skin_only": Invisible(
-        _BEST % ("R_s up to 80 %", 4.3, 0.8), visibility.lowpass(30e3)
-    ),
-    **{
-        f"lowpass_80kHz_skin{periods}": Invisible(
-            _BEST % ("R_s up to 40 %", 3.7, 0.3), visibility.lowpass(80e3)
-        )
-        for periods in ("", "_one_period")
-    },
-    "capacitance_5pF_skin": Invisible(
-        _BEST % ("R_s of dry skin up to 6 %", 0.2, 0.0), visibility.shunt(5e-12)
-    ),
-    "driver_Rprot_x1.05": Invisible(
-        _BEST % ("R_p up to 4 %", 0.6, 1.3),
-        visibility.series(0.05 * TransformerDriver().r_protection),
-    ),
+    # Every resistance and 1/C_p by 5 %: one calibration shows ratios to its resistor only.
+    "driver_Rload_wrong_5%": Invisible(),
+    # Up to 1.7 %: it has the impedance of another R_s + R_p ‖ C_p at every frequency.
+    "leak_100Rp": Invisible(),
+    # All: another driver with a resistor would give the same records.
+    "calibration_is_skin": Invisible(snr_db=40.0),
+    # R_p up to 13 %, and R_p of damp skin up to 6, 6 and 8 %.
+    **{f"gain_out_{sign}1%_all": Invisible(visibility.gain(0.01, True)) for sign in "+-"},
+    **{f"gain_out_{sign}1%_skin": Invisible(visibility.gain(0.01, False)) for sign in "+-"},
+    "crosstalk_1%_unloaded": Invisible(visibility.crosstalk(0.01)),
+    **{f"driver_Vp_{sign}2%_out_vs_th": Invisible(visibility.gain(0.02, False)) for sign in "+-"},
+    # R_s up to 80 and 40 %, of dry skin up to 6 %.
+    "slow_adc_filter_out_skin_only": Invisible(visibility.lowpass(30e3)),
+    "lowpass_80kHz_skin": Invisible(visibility.lowpass(80e3)),
+    "lowpass_80kHz_skin_one_period": Invisible(visibility.lowpass(80e3)),
+    "capacitance_5pF_skin": Invisible(visibility.shunt(5e-12)),
+    # R_p up to 4 %.
+    "driver_Rprot_x1.05": Invisible(visibility.series(0.05 * TransformerDriver().r_protection)),
 }
 """Perturbations that the records show too faintly, or not at all."""

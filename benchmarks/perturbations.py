@@ -1,9 +1,5 @@
 """What a laboratory does to recordings: is any answer wrong without saying so?
 
-    python -m benchmarks perturbations                       # all of it, in two processes
-    python -m benchmarks perturbations --only base hum60_0.02V_all --drivers 3 --snr-db 60
-    python -m benchmarks perturbations --quick               # few perturbations, in a minute
-
 Each perturbation (`benchmarks.perturbation_list`) is done to studies of several drivers, dry and
 damp skin behind each. An answer is *right* if every element is within five of its own standard
 errors of the truth and, where the bound of its standard error is 10 % at most, within 20 % of it.
@@ -12,10 +8,9 @@ called successful, and *silent* if it is wrong and called successful. An element
 a record is wrong if one of its values is farther away than that; if the fit remarks on something
 in the recording, any of them will do. A method without standard errors is held to the bound.
 
-Written are `perturbations.csv`, one row for each perturbation, noise, skin and method, and
-`perturbations.svg`. The targets: no silent answer but for the perturbations of `INVISIBLE`, of
-which no more are silent than the best possible test would miss (`benchmarks.visibility`), and at
-most 2 % of the undisturbed recordings refused.
+The targets: no silent answer but for the perturbations of `INVISIBLE`, of which no more are silent
+than the best possible test would miss (`benchmarks.visibility`), and at most 2 % of the undisturbed
+recordings refused.
 """
 
 import argparse
@@ -30,25 +25,14 @@ import jax
 import numpy as np
 
 import etid
-from benchmarks import charts
-from benchmarks.estimators import (
-    DEFAULT,
-    DETERMINED,
-    ELEMENTS,
-    FAR,
-    OFF,
-    OURS,
-    Answer,
-    Drivers,
-    fits,
-    found_by,
-)
+from benchmarks import charts, estimators
+from benchmarks.estimators import DEFAULT, ELEMENTS, FAR, Answer, Drivers, fits, found_by
 from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS, recorded
 from benchmarks.machine import make_room
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
 from benchmarks.perturbed_study import Truth, undisturbed
-from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, tabled
+from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, show, tabled
 
 TARGETS = {
     "silent": at_most(0),  # but for what no test can see
@@ -64,7 +48,6 @@ OPTIONS = (
     option("--only", nargs="+", choices=PERTURBATIONS, metavar="NAME", help="these perturbations"),
     option("--drivers", default=10),
     option("--snr-db", default=(40.0, 60.0), metavar="DB"),
-    option("--method", default=(DEFAULT,), choices=OURS),
 )
 
 
@@ -81,7 +64,7 @@ def in_stderrs(of: Answer) -> np.ndarray:
 def kind(of: Answer) -> str:
     """What an answer is, of `KINDS`."""
     far = (in_stderrs(of) > FAR) & of.exact
-    far |= (np.abs(of.error) > OFF) & (of.bound <= DETERMINED)
+    far |= (np.abs(of.error) > estimators.OFF) & (of.bound <= estimators.DETERMINED)
     wrong = bool(far.any() or np.isnan(of.error).any())
     if of.successful:
         return "silent" if wrong else "right"
@@ -91,10 +74,7 @@ def kind(of: Answer) -> str:
 def error_of(values: np.ndarray, truth: Truth, remarked: bool) -> np.ndarray:
     """Relative errors of an answer; 0 where the truth has no such element.
 
-    Args:
-        values: The elements that are said.
-        truth: What is right.
-        remarked: Whether the answer says that something was wrong with the recording.
+    What moves is near enough everywhere in its range, if the answer has remarked on the recording.
     """
     to_low, to_high = values / truth.low - 1, values / truth.high - 1
     inside = (to_low >= 0) & (to_high <= 0)
@@ -113,29 +93,25 @@ def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[s
     return {path: np.array(list(of.relative.values())) for path, of in etid.bound(scene).items()}
 
 
-def answers_of(
-    names: Sequence[str], number: int, snr_db: float, methods: Sequence[str]
-) -> list[Answer]:
+def answers_of(names: Sequence[str], number: int, snr_db: float) -> list[Answer]:
     """All answers behind one driver with one noise; perturbations that share a driver together."""
     with jax.enable_x64(True):  # of a worker process
         drivers, found = Drivers(), list[Answer]()
-        studies = {name: PERTURBATIONS[name](undisturbed(number, snr_db)) for name in names}
-        calibrations = {n: [of.recording(number) for of in s.calibrations]
-                        for n, s in studies.items()}  # fmt: skip
-        together: dict[tuple, list[tuple[str, Record, Truth]]] = {}
-        behind = [(method, name) for method in methods for name in names]
-        known = {place: drivers.of(calibrations[place[1]], place[0]) for place in behind}
-        for method, name in behind:
-            trials = [(name, of, studies[name].truths[of.path]) for of in studies[name].trials]
-            together.setdefault((method, id(known[method, name])), []).extend(trials)
-        for (method, _), trials in together.items():
-            driver = known[method, trials[0][0]]
-            records = [of.recording(number) for _, of, _ in trials]
-            for (name, of, truth), fit in zip(trials, fits(records, driver, method), strict=True):
+        together: dict[int, list[tuple[str, Record, Truth]]] = {}
+        behind: dict[int, etid.Driver | None] = {}
+        for name in names:
+            study = PERTURBATIONS[name](undisturbed(number, snr_db))
+            driver = drivers.of([of.recording(number) for of in study.calibrations], DEFAULT)
+            behind[id(driver)] = driver
+            trials = [(name, of, study.truths[of.path]) for of in study.trials]
+            together.setdefault(id(driver), []).extend(trials)
+        for key, trials in together.items():
+            every = fits([of.recording(number) for _, of, _ in trials], behind[key], DEFAULT)
+            for (name, of, truth), fit in zip(trials, every, strict=True):
                 values, stderr, verdict = found_by(fit)
                 found.append(
                     Answer(
-                        *(method, number, of.path, verdict),
+                        *(DEFAULT, number, of.path, verdict),
                         error=error_of(values, truth, fit is not None and int(fit.remarks) != 0),
                         stderr=stderr / ((truth.low + truth.high) / 2),
                         bound=_bounds(snr_db, of.samples, of.bits, of.full_scale)[of.path],
@@ -177,31 +153,16 @@ def _worst(silent: Sequence[Answer]) -> dict[str, Any]:
                     strict=True))  # fmt: skip
 
 
-def summary(answers: Sequence[Answer]) -> Iterator[str]:
-    """Lines of a table: one for each perturbation, noise and method."""
-    yield f"{'perturbation':<36}{'SNR':>4}" + "".join(f"{name:>8}" for name in KINDS)
-    for row in table(answers, ("perturbation", "snr_db", "method")):
-        worst = "" if row["method"] == DEFAULT else f"{row['method']}  "
-        if row["silent"]:
-            worst += (
-                f"{row['worst_element']} {row['worst_stderrs']:.1f} standard errors, "
-                f"{100 * row['worst_error']:.1f} %, {row['worst_path']}  "
-            )
-        counts = "".join(f"{row[name]:>8}" for name in KINDS)
-        yield f"{row['perturbation']:<36}{row['snr_db']:>4.0f}{counts}   {worst}{row['verdicts']}"
-
-
 def targets(answers: Sequence[Answer]) -> Iterator[Target]:
     """What the default method misses."""
-    of_default = [a for a in answers if a.method == DEFAULT]
     silent, refused = TARGETS
-    for row in table(of_default, ("perturbation", "snr_db", "path")):
+    for row in table(answers, ("perturbation", "snr_db", "path")):
         name, place, count = row["perturbation"], (row["path"], row["snr_db"]), row[silent]
         known = INVISIBLE.get(name)
         if count and not (known and known.excuses(*place, count, row["answers"])):
             where = f"{silent}: {name}, {place[0]} at {place[1]:g} dB"
             yield Target(where, count, *TARGETS[silent], f"{count} of {row['answers']}")
-    for row in table(of_default, ("perturbation",)):
+    for row in table(answers, ("perturbation",)):
         if row["perturbation"] in UNDISTURBED:
             share = (row["refused"] + row["said"]) / row["answers"]
             yield Target(f"{refused}: {row['perturbation']}", share, *TARGETS[refused])
@@ -213,11 +174,7 @@ def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     for row in sorted(rows, key=lambda row: (row["path"], row["snr_db"]), reverse=True):
         panel = panels.setdefault(f"{row['path']}, {row['snr_db']:g} dB", {})
         panel[_label(row["perturbation"])] = {kind: row[kind] for kind in KINDS}
-    order = list(dict.fromkeys(_label(row["perturbation"]) for row in rows))
-    sorted_panels = {
-        name: {row: of[row] for row in order if row in of} for name, of in panels.items()
-    }
-    charts.shares(sorted_panels, charts.ANSWERS, path)
+    charts.shares(panels, charts.ANSWERS, path)
 
 
 def _label(name: str) -> str:
@@ -230,25 +187,23 @@ def _label(name: str) -> str:
 
 def main(arguments: argparse.Namespace) -> bool:
     """Draw, count and print; write the table with every driver that is done, and the picture."""
-    quick, methods, folder = arguments.quick, arguments.method, arguments.folder
+    quick, folder = arguments.quick, arguments.folder
     names = list(FEW) if quick else arguments.only or list(PERTURBATIONS)
     numbers = range(2 if quick else arguments.drivers)
-    tasks = [(names, number, snr, methods) for number in numbers for snr in arguments.snr_db]
-    place = {name: number for number, name in enumerate(names)}
+    tasks = [(names, number, snr) for number in numbers for snr in arguments.snr_db]
 
     def ordered(done: Iterable[Sequence[Answer]]) -> list[Answer]:
-        every = [answer for found in done for answer in found]
-        return sorted(
-            every, key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.method, a.seed)
-        )
+        every = (answer for found in done for answer in found)
+        place = {name: number for number, name in enumerate(names)}
+        return sorted(every, key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.seed))
 
     def rows(done: Mapping[int, Sequence[Answer]]) -> list[dict[str, Any]]:
         return table(ordered(done.values()), ("perturbation", "snr_db", "path", "method"))
 
     workers = 1 if quick else arguments.workers
     settings = {"workers": workers, "unit": "driver", "keep": "perturbations"}
-    answers = ordered(tabled(folder / "perturbations.csv", rows, answers_of, tasks, **settings))
-    of_one = [one for one in answers if one.method == methods[0]]
-    draw(table(of_one, ("perturbation", "snr_db", "path", "method")), folder / "perturbations.svg")
-    print("\n".join(summary(answers)))
-    return report(targets(answers))
+    found = tabled(folder / "perturbations.csv", rows, answers_of, tasks, **settings)
+    draw(rows(dict(enumerate(found))), folder / "perturbations.svg")
+    for row in table(ordered(found), ("perturbation", "snr_db")):
+        show(row)
+    return report(targets(ordered(found)))

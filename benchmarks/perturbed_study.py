@@ -1,7 +1,5 @@
 """A study in which all is well, and the ways to change it.
 
-`undisturbed` draws a study in which all is well: dry and damp skin, 98.8 kΩ, three periods at
-200 kHz, trigger delays of 50 ns rms, parts of the driver 3 % from those of `TransformerDriver`.
 A `Change` is a function from that study to another; `benchmarks.perturbation_list` has them all.
 """
 
@@ -12,8 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.disturbances import Leaky, Nonlinear, Pink, Shunted, Tail
-from benchmarks.laboratory import CORNER, SCALE, Crosstalk, Output, Record, noise
+from benchmarks import disturbances
+from benchmarks.disturbances import Nonlinear
+from benchmarks.laboratory import CORNER, SCALE, Output, Record, noise
 from benchmarks.ladder import LOADS
 from etid.simulation.published import REFERENCE
 from etid.simulation.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
@@ -34,12 +33,8 @@ class Truth:
 
     low: Float[np.ndarray, " element"]  # smallest value of each element in the record
     high: Float[np.ndarray, " element"]  # largest
-    # whether it went from the one to the other: an answer that does not say so claims that the
-    # elements were what it gives all the time
-    moves: bool = False
-    # whether the elements are a matter of words, as of skin that is not one RC: they are wrong by
-    # 20 % only
-    words: bool = False
+    moves: bool = False  # whether it went from the one to the other, which an answer has to say
+    words: bool = False  # whether the elements are a matter of words: wrong by 20 % only
 
     @classmethod
     def of(cls, *skins: SkinLoad, **more: bool) -> "Truth":
@@ -62,13 +57,7 @@ Change = Callable[[Study], Study]
 
 
 def drawn_driver(number: int, spread: float, usual: TransformerDriver) -> TransformerDriver:
-    """One of many transformers of a kind.
-
-    Args:
-        number: Of the driver; equal numbers are equal drivers.
-        spread: Standard deviation of the logarithm of every part.
-        usual: The medians of the parts, and what all have in common: pulse and turns.
-    """
+    """One of many transformers, whose parts have this standard deviation of their logarithms."""
     rng = np.random.default_rng([number, *b"driver"])
     parts = {
         field.name: getattr(usual, field.name) * float(np.exp(spread * rng.standard_normal()))
@@ -79,11 +68,9 @@ def drawn_driver(number: int, spread: float, usual: TransformerDriver) -> Transf
 
 
 def undisturbed(number: int, snr_db: float) -> Study:
-    """The study of one driver.
+    """The study of one driver: dry and damp skin, 98.8 kΩ, three periods at 200 kHz.
 
-    Args:
-        number: Of the driver; parts and delays are drawn from it.
-        snr_db: Of every record [dB].
+    Its parts differ by 3 % from those of `TransformerDriver`.
     """
     driver = drawn_driver(number, PARTS, TransformerDriver())
     rng = np.random.default_rng([number, *b"delays"])
@@ -161,7 +148,16 @@ def louder(factor: float) -> Callable[[Record], Record]:
 
 def crosstalk(later: float) -> Callable[[Record], Record]:
     """Let the loaded voltage see 1 % of an unloaded one whose pulse is later by so much [s]."""
-    return lambda of: out(added=(Crosstalk(of.th, 0.01, later),))(of)
+
+    def change(of: Record) -> Record:
+        other = dataclasses.replace(of.th, delay=of.th.delay - later)
+
+        def seen(time: Float[np.ndarray, " time"], rng: np.random.Generator):
+            return 0.01 * other.volts(of.sample_rate, time.size, rng)
+
+        return out(added=(seen,))(of)
+
+    return change
 
 
 def _other(change: Callable[[Record], Record], truth: Callable[[str], Truth]) -> Change:
@@ -246,10 +242,7 @@ def longer(change: Change = lambda study: study) -> Change:
 
 
 def coherent(antialias: float = CORNER) -> Change:
-    """Record with a whole number of samples in each period, 240 kHz at 60 Hz.
-
-    `antialias` is the corner of the anti-alias filter, relative to the sample rate.
-    """
+    """Record a whole number of samples in each period; `antialias` is of the sample rate."""
     rate = {"sample_rate": COHERENT_RATE, "samples": round(PERIODS * COHERENT_RATE / 60)}
 
     def change(study: Study) -> Study:
@@ -262,7 +255,7 @@ def coherent(antialias: float = CORNER) -> Change:
 
 def pink(of: Record) -> Record:
     """Both voltages with 1/f noise of three times the effective value of the white noise."""
-    return both(added=(Pink(3 * of.sigma),))(of)
+    return both(added=(disturbances.pink(3 * of.sigma),))(of)
 
 
 def tail(height: float, time_constant: float) -> Callable[[Record], Record]:
@@ -270,22 +263,21 @@ def tail(height: float, time_constant: float) -> Callable[[Record], Record]:
 
     def change(of: Record) -> Record:
         driver = of.out.driver
-        end = driver.lead_in + driver.width
-        return out(added=(Tail(SCALE * height, time_constant, end, 1 / PULSE_RATE),))(of)
+        times = time_constant, driver.lead_in + driver.width, 1 / PULSE_RATE
+        return out(added=(disturbances.tail(SCALE * height, *times),))(of)
 
     return change
 
 
 def shunted(c: float) -> Callable[[Record], Record]:
     """Put a capacitor [F] across every load."""
-    return lambda of: out(loads=tuple(Shunted(load, c) for load in of.out.loads))(of)
+
+    def across(load: Impedance) -> Impedance:
+        return lambda f: load(f) / (1 + 2j * np.pi * f * c * load(f))
+
+    return lambda of: out(loads=tuple(map(across, of.out.loads)))(of)
 
 
 def single(change: Change) -> Change:
     """Record one period and a little more."""
     return lambda study: change(all_records(record(samples=3_400))(study))
-
-
-def leaking(skin: SkinLoad) -> Leaky:
-    """Skin with a leak of a hundred times its R_p across it."""
-    return Leaky(skin, 100 * skin.r_p)

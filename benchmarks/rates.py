@@ -2,13 +2,9 @@
 
 Trials behind one driver share its error: ten of them are not ten draws. The interval is that of
 Clopper and Pearson for an effective number n* of trials (Korn and Graubard, Survey Methodology 24,
-1998, 193-201),
-
-    n* = p (1 − p) / V,      V = m / (m − 1) Σ_d (events_d − p trials_d)² / trials²,
-
-p the rate, and V its variance between m drivers d; but not more than there are trials. Where all
-drivers have the same rate, as where nothing failed, V says nothing, and n* = m: as if the trials
-behind a driver were one.
+1998, 193-201), n* = p (1 − p) / V, V = m / (m − 1) Σ_d (events_d − p trials_d)² / trials², p the
+rate, and V its variance between m drivers d; but not more than there are trials. Where all drivers
+have the same rate, V says nothing, and n* = m: as if the trials behind a driver were one.
 """
 
 from collections.abc import Iterable, Sequence

@@ -46,18 +46,14 @@ def main(arguments: argparse.Namespace) -> bool:
             f"{snr_db:<8g}{ended.sum():<6}{(~ended).sum():<8}{1e3 * ours:>6.0f}{worth:>11.0f}"
             f"{nuts:>8.1f}"
         )
+        farthest = np.take_along_axis(ratio, np.abs(ratio - 1).argmax(0)[None], 0)[0]
         for (name, limits), of, worst in zip(
-            TARGETS.items(), (shift, ratio), (shift.max(0), _farthest(ratio)), strict=True
+            TARGETS.items(), (shift, ratio), (shift.max(0), farthest), strict=True
         ):
             for element, middle, far in zip(ELEMENTS, np.median(of, axis=0), worst, strict=True):
                 text = f"{middle:.3f} (worst {far:.2f})"
                 asked.append(Target(f"{snr_db:g} dB, {element}: {name}", middle, *limits, text))
     return report(asked)
-
-
-def _farthest(ratio: np.ndarray) -> np.ndarray:
-    """The ratio of each element that is farthest from 1."""
-    return np.take_along_axis(ratio, np.abs(ratio - 1).argmax(0)[None], 0)[0]
 
 
 def compared(snr_db: float, fits: int) -> dict[str, np.ndarray]:

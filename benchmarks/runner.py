@@ -1,13 +1,7 @@
 """What all benchmarks share: options, tasks in processes, tables that grow, and targets.
 
 A benchmark is a module with `OPTIONS` and `main(arguments)`, which returns whether every target is
-met. The first line of its docstring is its help. One that measures time has `PINNED = True`.
-
-A question over many cells is asked in four steps: the tasks (what is drawn in a cell, with which
-seeds), `tabled` (does them in processes and writes the table after each), rates of events with
-their intervals (`benchmarks.rates`), and the targets, which stand in one table at the head of the
-file. What a task found is kept as long as the commit is the same: the same command goes on where
-it was interrupted.
+met; the first line of its docstring is its help. One that measures time has `PINNED = True`.
 """
 
 import argparse
@@ -34,13 +28,7 @@ Option = Callable[[argparse.ArgumentParser], Any]
 
 
 def option(*names: str, default: Any = None, **settings: Any) -> Option:
-    """An option of a benchmark; its default tells its type.
-
-    Args:
-        names: As argparse takes them.
-        default: False makes a flag, a tuple an option with several values.
-        settings: As argparse takes them.
-    """
+    """An option; its default tells its type: False makes a flag, a tuple several values."""
     if default is False:
         settings = {"action": "store_true", **settings}
     elif isinstance(default, tuple):
@@ -63,15 +51,10 @@ def each(
     unit: str = "task",
     keep: str = "",
 ) -> Iterator[tuple[int, Any]]:
-    """Results of a call with their numbers, as they are done.
+    """Results of a call with the numbers of their tasks, as they are done.
 
-    Args:
-        call: What is called with each task.
-        tasks: Arguments of the calls.
-        workers: Processes; 1 is this one.
-        unit: What a task is called.
-        keep: Name under which the results are kept, for other runs of this commit with these
-            versions; none for an empty name, or while the working tree is not that of a commit.
+    `keep` names a folder in which they are kept for other runs of this commit with these versions;
+    nothing is kept while the working tree is not that of a commit.
     """
     folder = _kept(keep) if keep else None
 
@@ -100,11 +83,10 @@ def _kept(name: str) -> pathlib.Path | None:
     source = provenance()
     if source["commit"] == "unknown" or source["commit"].endswith("+"):
         return None
-    place = hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
-    for other in KEPT.glob(f"{name}-*"):
-        if other.name != f"{name}-{place}":
-            shutil.rmtree(other)
-    return KEPT / f"{name}-{place}"
+    place = KEPT / f"{name}-{hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]}"
+    for other in {*KEPT.glob(f"{name}-*")} - {place}:
+        shutil.rmtree(other)
+    return place
 
 
 def _called(
@@ -126,15 +108,7 @@ def tabled(
     tasks: Sequence[tuple],
     **settings: Any,
 ) -> list[Any]:
-    """Results in the order of the tasks; the table is written after each.
-
-    Args:
-        path: CSV to write.
-        rows: Rows of the table of what is done so far, by the number of the task.
-        call: What is called with each task.
-        tasks: Arguments of the calls.
-        settings: Others of `each`.
-    """
+    """Results in the order of the tasks; after each, the `rows` of what is done are written."""
     done: dict[int, Any] = {}
     for number, found in each(call, tasks, **settings):
         done[number] = found
@@ -143,8 +117,16 @@ def tabled(
     return list(done.values())
 
 
-Limits = tuple[float, float]
-"""Least and largest value that meet a target; NaN for none."""
+def show(row: Mapping[str, Any], *names: str) -> None:
+    """Print some columns of a row in a line, or all."""
+    texts = {
+        name: format(row[name], ".4g") if isinstance(row[name], float) else str(row[name])
+        for name in names or row
+    }
+    tqdm.write("  ".join(f"{name} {text}" for name, text in texts.items() if text))
+
+
+Limits = tuple[float, float]  # least and largest value that meet a target; NaN for none
 
 
 def at_least(least: float) -> Limits:
@@ -158,23 +140,14 @@ def at_most(most: float) -> Limits:
 
 
 class Target(NamedTuple):
-    """A number that was measured, and its limits; NaN for none.
+    """A number that was measured, and its limits; NaN for none."""
 
-    Attributes:
-        name: What was measured.
-        value: The number that must keep to the limits.
-        least: Smallest value that meets the target.
-        most: Largest one.
-        text: How it is printed, if not as the number.
-        interval: What its scatter allows, if that is known; it excuses nothing.
-    """
-
-    name: str
+    name: str  # what was measured
     value: float
     least: float = np.nan
     most: float = np.nan
-    text: str = ""
-    interval: tuple[float, float] | None = None
+    text: str = ""  # how it is printed, if not as the number
+    interval: tuple[float, float] | None = None  # its scatter, if known; it excuses nothing
 
     @classmethod
     def of(cls, name: str, value: Rate, limits: Limits = (np.nan, np.nan)) -> "Target":
@@ -199,9 +172,12 @@ class Target(NamedTuple):
         return f"{self.name:<58} {self.text or format(self.value, '.4g')}{said}"
 
 
-def report(targets: Iterable[Target]) -> bool:
-    """Print numbers with their targets; whether all are met."""
+def report(targets: Iterable[Target], path: pathlib.Path | None = None) -> bool:
+    """Print numbers with their targets, and write them as CSV if asked; whether all are met."""
     every = list(targets)
+    if path is not None:
+        heads = ("quantity", "value", "least", "most")
+        write_csv(path, [dict(zip(heads, one, strict=False)) for one in every])
     for one in every:
         print(one, flush=True)
     return all(one.met for one in every)

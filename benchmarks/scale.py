@@ -2,9 +2,8 @@
 
 Every measurement is a job in a process of its own, whose peak memory is the job's, on as many cores
 as it has workers: `python -m benchmarks.scale JOB` with a JSON object prints another. The file lies
-in the page cache, which flatters reading; reading alone is h5py, recording after recording.
-Compilation is in no time but `start` and the CPU time of workers, which tells of other work on the
-machine.
+in the page cache, which flatters reading. Compilation is in no time but `start` and the CPU time of
+workers, which tells of other work on the machine.
 """
 
 import argparse
@@ -28,8 +27,8 @@ import numpy as np
 
 import etid
 from benchmarks.large_file import LAYOUTS, large_file
-from benchmarks.machine import ROOT, cores, write_csv
-from benchmarks.runner import QUICK, Target, at_least, at_most, option, report
+from benchmarks.machine import ROOT, cores, timed, write_csv
+from benchmarks.runner import QUICK, Target, at_least, at_most, option, report, show
 from etid.estimators.registry import names
 from etid.identify import file as streaming
 
@@ -58,8 +57,6 @@ OPTIONS = (
 
 
 def _by_h5py(file: str, whole_stacks: bool) -> None:
-    """Read all samples with h5py alone, one recording after the other or a stack at once."""
-
     def visit(_: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and (item.ndim == 1 or whole_stacks):
             item[()]
@@ -72,7 +69,6 @@ def _by_h5py(file: str, whole_stacks: bool) -> None:
 
 
 def _by_etid(file: str) -> None:
-    """Load all recordings."""
     with etid.read(file) as study:
         for _ in study.recordings():
             pass
@@ -95,13 +91,13 @@ def _fit(job: dict[str, Any]) -> dict[str, Any]:
         if job["warm"]:
             target = pathlib.Path(job["target"]).with_suffix(".warm.h5")
             streaming.PART = job["warm_part"]
-            start = _timed(lambda: streaming.fit_file(job["warm"], target, **arguments))[1]
+            start = timed(lambda: streaming.fit_file(job["warm"], target, **arguments))[1]
             target.unlink()
         streaming.PART = job["part"]
         if job["log"]:
             _log_parts(job["log"])
         arguments["resume"], before = job["resume"], time.process_time()
-        outcome, seconds = _timed(
+        outcome, seconds = timed(
             lambda: streaming.fit_file(job["file"], job["target"], **arguments)
         )
         cpu = time.process_time() - before
@@ -123,18 +119,12 @@ def _log_parts(log: str) -> None:
     streaming.identify_part = logged
 
 
-def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    begin = time.perf_counter()
-    found = call()
-    return found, time.perf_counter() - begin
-
-
 def done(job: dict[str, Any]) -> dict[str, Any]:
     """Do a job; seconds, and peak memory of this process and of its largest child [B]."""
     if job["what"] == "fit":
         found = _fit(job)
     else:
-        found = {"seconds": _timed(lambda: READERS[job["what"]](job["file"]))[1]}
+        found = {"seconds": timed(lambda: READERS[job["what"]](job["file"]))[1]}
     own, children = (
         1024 * resource.getrusage(who).ru_maxrss
         for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
@@ -148,9 +138,7 @@ class Plan(NamedTuple):
     folder: pathlib.Path  # where the files are or will be
     recordings: int  # how many in a file
     part: int  # how many are written at once
-    # estimators; None is the default one. The last is run in all layouts
-    methods: Sequence[str | None]
-    killed: str | None  # estimator of the run that is killed
+    methods: Sequence[str | None]  # None is the default one; the last is killed, in all layouts run
 
 
 def _start(folder: pathlib.Path, job: dict[str, Any]) -> subprocess.Popen[bytes]:
@@ -235,7 +223,7 @@ class Resumed(NamedTuple):
 
 def resume(plan: Plan) -> Resumed:
     """Kill a run at seeded moments, resume it, and compare with a run that was left alone."""
-    job = fit_job(plan, "contiguous", plan.killed, 1) | {"warm": ""}
+    job = fit_job(plan, "contiguous", plan.methods[-1], 1) | {"warm": ""}
     whole, target = (plan.folder.absolute() / f"{name}.h5" for name in ("whole", "resumed"))
     log = target.with_suffix(".log")
     log.unlink(missing_ok=True)
@@ -267,15 +255,14 @@ def resume(plan: Plan) -> Resumed:
 
 def _same(one: pathlib.Path, other: pathlib.Path) -> bool:
     """Whether two files hold the same arrays, bit for bit."""
+
+    def bits(column: np.ndarray) -> Any:  # texts are objects, whose bits are addresses
+        return column.tolist() if column.dtype.hasobject else column.tobytes()
+
     with h5py.File(one) as a, h5py.File(other) as b:
         return set(a) == set(b) and all(
-            _bits(np.asarray(a[name])) == _bits(np.asarray(b[name])) for name in a
+            bits(np.asarray(a[name])) == bits(np.asarray(b[name])) for name in a
         )
-
-
-def _bits(column: np.ndarray) -> Any:
-    """What is equal if all bits are, NaN too; texts are objects, whose bits are addresses."""
-    return column.tolist() if column.dtype.hasobject else column.tobytes()
 
 
 def targets(table: Sequence[dict[str, Any]], resumed: Resumed) -> Iterator[Target]:
@@ -294,18 +281,17 @@ def targets(table: Sequence[dict[str, Any]], resumed: Resumed) -> Iterator[Targe
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table, write it as CSV; whether every target is met."""
-    chosen = [None if name == "default" else name for name in arguments.method]
-    plan = Plan(arguments.folder, arguments.recordings, streaming.PART, chosen, chosen[-1])
+    names, recordings, part = arguments.method, arguments.recordings, streaming.PART
     if arguments.quick:
-        quick = "equation_error"
-        plan = Plan(arguments.folder, min(arguments.recordings, 400), 32, (quick,), quick)
+        names, recordings, part = METHODS[1:], min(recordings, 400), 32
+    methods = [None if name == "default" else name for name in names]
+    plan = Plan(arguments.folder, recordings, part, methods)
     table: list[dict[str, Any]] = []
     for row in rows(plan):
         table.append(row)
         alone = next(r for r in table if r["layout"] == row["layout"])  # the first reads by h5py
         row["of_reading"] = row["seconds"] / alone["seconds"]
-        numbers = (f"{name} {of:.4g}" for name, of in row.items() if isinstance(of, float | int))
-        print(f"{row['what']:<26}{row['layout']:<11}", ", ".join(numbers), flush=True)
+        show(row)
     (plan.folder / "fits.h5").unlink(missing_ok=True)
     resumed = resume(plan)
     print(

@@ -1,11 +1,8 @@
 """Is the simplest circuit found that a recording supports, and are the intervals honest after it?
 
-    python -m benchmarks selection            # all of it, 45 minutes of processor time
-    python -m benchmarks selection --quick    # few drivers and cells, a minute or two
-
 Recordings of five kinds of circuits, dry and damp, behind drivers drawn anew, from 20 to 80 dB
 (`benchmarks.selection_draws`). Written are `selection.csv`, one row for each truth and SNR,
-`counts.csv`, one row for each cell of the failure map with `circuit="auto"`, and the picture
+`selection_map.csv`, one row for each cell of the failure map with `circuit="auto"`, and
 `selection.svg`. `benchmarks.selection_counts` says what "decisive" means, and which criteria are
 compared.
 """
@@ -21,26 +18,15 @@ from typing import Any
 import numpy as np
 
 import etid
-from benchmarks import charts, selection_rival
+from benchmarks import charts, runner, selection_rival
 from benchmarks import selection_counts as counts
 from benchmarks.estimators import Answer
 from benchmarks.failure_axes import Cell
 from benchmarks.failure_draws import AUTO, Effort, answers
-from benchmarks.machine import median_time, write_csv
+from benchmarks.machine import median_time, timed, write_csv
 from benchmarks.perturbed_study import DELAY
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
-from benchmarks.runner import (
-    FOLDER,
-    QUICK,
-    WORKERS,
-    Target,
-    at_least,
-    at_most,
-    each,
-    option,
-    report,
-    tabled,
-)
+from benchmarks.runner import Target, at_least, at_most, each, option, report, tabled
 from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
 from etid.selection.search import USUAL
 from etid.simulation import scenes
@@ -53,9 +39,10 @@ BATCH, SINGLES = 64, 16  # recordings of a pair: at once, and one at a time
 FEW, FEW_PAIRS, FEW_DRIVERS, FEW_SNR, STEP = Effort(1, 4), 3, 2, (20, 60), 20
 RIVAL_DRIVERS, RIVAL_SNR = 1, (20, 40, 60)  # ten seconds for each recording
 
-OPTIONS = (QUICK, WORKERS, FOLDER, option("--drivers", default=25, help="of an SNR"))
-
-
+OPTIONS = (
+    *(runner.QUICK, runner.WORKERS, runner.FOLDER),
+    option("--drivers", default=25, help="of an SNR"),
+)
 TARGETS = {
     "right circuit where decisive, from 30 dB": at_least(0.99),
     "spurious element, from 20 dB": at_most(0.005),
@@ -75,13 +62,8 @@ FACES = {
 }
 
 
-def _rate(name: str, of: Rate) -> Target:
-    return Target.of(name, of, TARGETS[name])
-
-
-def _coverage(name: str, drawn: Sequence[Drawn], *quantities: str) -> Target:
-    of = rate(*counts.covered(drawn, *quantities))
-    return Target.of(f"coverage, {name}", of, TARGETS["coverage"])
+def _rate(name: str, of: Rate, at: str = "") -> Target:
+    return Target.of(f"{name}{at}", of, TARGETS[name])
 
 
 def chosen(rows: Sequence[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[Target]:
@@ -92,12 +74,12 @@ def chosen(rows: Sequence[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[T
     richer = rate([one.is_richer for one in drawn], [one.driver for one in drawn])
     yield _rate("right circuit where decisive, from 30 dB", right)
     yield _rate("spurious element, from 20 dB", richer)
-    yield _coverage("all SNRs: all", drawn, *counts.QUANTITIES)
-    for name in counts.QUANTITIES:
-        yield _coverage(f"all SNRs: {name}", drawn, name)
+    groups = {"all SNRs: all": (drawn, counts.QUANTITIES)}
+    groups |= {f"all SNRs: {name}": (drawn, (name,)) for name in counts.QUANTITIES}
     for snr in sorted({one.snr_db for one in drawn}):
-        some = [one for one in drawn if one.snr_db == snr]
-        yield _coverage(f"{snr:g} dB: all", some, *counts.QUANTITIES)
+        groups[f"{snr:g} dB: all"] = [one for one in drawn if one.snr_db == snr], counts.QUANTITIES
+    for name, (of, quantities) in groups.items():
+        yield _rate("coverage", rate(*counts.covered(of, *quantities)), f", {name}")
 
 
 def criteria(rows: Sequence[dict[str, Any]]) -> Iterator[Target]:
@@ -149,13 +131,12 @@ def time_ratios(pairs: int) -> Iterator[Target]:
 
         for of, call in zip(ratios.values(), (in_batch, one_by_one), strict=True):
             for number in range(pairs + 1):
-                seconds = []
-                for circuit in (None, "auto"):
-                    begin = time.process_time()
-                    call(circuit)
-                    seconds.append(time.process_time() - begin)
+                plain, auto = (
+                    timed(functools.partial(call, circuit), time.process_time)[1]
+                    for circuit in (None, "auto")
+                )
                 if number:  # the first pair compiles
-                    of.append(seconds[1] / seconds[0])
+                    of.append(auto / plain)
     for name, of in ratios.items():
         low, middle, high = np.quantile(of, (0.25, 0.5, 0.75))
         text = f"{middle:.2f} (quartiles {low:.2f} to {high:.2f}) of {len(of)} pairs"
@@ -164,12 +145,7 @@ def time_ratios(pairs: int) -> Iterator[Target]:
 
 
 def rival(rows: list[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[Target]:
-    """Add the choices of the rival to the rows, and compare right choices.
-
-    Args:
-        rows: The table; it gets the columns `rival_NAME`.
-        drawn: The recordings for which the rival chooses too.
-    """
+    """Compare right choices, and add those of the rival to the table as columns `rival_NAME`."""
     of_study = dict.fromkeys((one.snr_db, one.driver) for one in drawn)
     theirs = selection_rival.by_impedance_py([selection_rival.measured(*of) for of in of_study])
     for row in rows:

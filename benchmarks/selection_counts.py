@@ -7,11 +7,8 @@ this: they contain the truth, and lose ln n, about 7, for each spurious element 
 The criteria are compared on the same fits, all candidates being fitted, with the rest of the rule
 unchanged (`etid.selection.evidence`). AICc is −2 log L + 2 p + 2 p (p + 1) / (n − p − 1). The
 evidence of Laplace is −2 log ∫ L π with normal priors of the logarithms of the elements, the
-typical value within a factor of 10, and α uniform from 0 to 1.
-
-Cells, drivers and trials of the failure map with `circuit="auto"` are those of
-`benchmarks.failure_map`, and so is what *wrong* and *silent* mean. An answer is *right* if it is
-successful and no element is wrong.
+typical value within a factor of 10, and α uniform from 0 to 1. An answer in a cell of the failure
+map is *right* if it is successful and no element is wrong.
 """
 
 import math

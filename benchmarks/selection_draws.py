@@ -13,14 +13,7 @@ import etid
 from benchmarks.ladder import LOADS, recorded
 from benchmarks.machine import make_room
 from benchmarks.perturbed_study import PARTS, drawn_driver
-from etid.circuits.circuit import (
-    AbstractCircuit,
-    ParallelRC,
-    Resistor,
-    SkinCole,
-    SkinLayers,
-    SkinRC,
-)
+from etid.circuits.circuit import AbstractCircuit, ParallelRC, Resistor, SkinCole, SkinRC
 from etid.identify.arguments import fed
 from etid.identify.options import Options
 from etid.identify.study import choices as choices_of
@@ -35,11 +28,11 @@ SNR_DB = (20, 30, 40, 50, 60, 80)
 RESISTORS = {"dry": 216.6e3, "damp": 21.62e3}  # [ohm], of the paper's Table I
 
 
-def _layers(skin: SkinRC, share: float, slower: float) -> SkinLayers:
+def _layers(skin: SkinRC, share: float, slower: float) -> etid.SkinLayers:
     """R_p in two layers; the second has this share, and is slower by this factor."""
     r_p, tau = float(skin.r_p), float(skin.r_p * skin.c_p)
     r_1, r_2 = (1 - share) * r_p, share * r_p
-    return SkinLayers(skin.r_s, r_1, tau / r_1, r_2, slower * tau / r_2)
+    return etid.SkinLayers(skin.r_s, r_1, tau / r_1, r_2, slower * tau / r_2)
 
 
 def _truths() -> dict[str, AbstractCircuit]:
@@ -54,7 +47,7 @@ def _truths() -> dict[str, AbstractCircuit]:
             found[f"Cole {alpha}, {name}"] = SkinCole(skin.r_s, skin.r_p, tau, alpha)
         for share, slower in ((0.5, 4.5), (0.3, 10.0)):
             found[f"layers {share}, {slower:g}, {name}"] = _layers(skin, share, slower)
-    order = [one.__name__ for one in (Resistor, ParallelRC, SkinRC, SkinCole, SkinLayers)]
+    order = [one.__name__ for one in (Resistor, ParallelRC, SkinRC, SkinCole, etid.SkinLayers)]
     return dict(sorted(found.items(), key=lambda item: order.index(type(item[1]).__name__)))
 
 
@@ -107,12 +100,7 @@ def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Sele
 
 
 def draws(snr_db: float, number: int) -> list[Drawn]:
-    """One recording of each truth; none if the driver is not identified.
-
-    Args:
-        snr_db: Of every record [dB].
-        number: Of the driver, and the seed of the records.
-    """
+    """One recording of each truth behind a driver [dB]; none if the driver is not identified."""
     with jax.enable_x64(True):  # of a worker process
         study = scene(snr_db, number).simulate(number)
         driver = etid.identify_driver(study["calibration"], throw=False)

@@ -1,15 +1,10 @@
 """The same choice by impedance.py: five fits to an impedance spectrum, and the smallest BIC.
 
-Two kinds of spectra are given to it:
-
-- `measured`: from the recordings that etid chooses for, by the harmonics, the noise and the Z_th
-  that etid finds in them,
-
-      Z = Z_th Y / (X − Y),   σ_Z = |Z_th| √(σ_x² |Y|² + σ_y² |X|²) / |X − Y|²,
-
-  for the coefficients X of V_th and Y of V_out, to first order in their noise;
-- `exact`: with the noise of the scene, but without an error of Z_th and without a trigger delay,
-  which no recording gives. etid's `identify_impedance` and its rule choose for these, too.
+It gets `measured` spectra, from the recordings that etid chooses for, by the harmonics, the noise
+and the Z_th that etid finds in them: Z = Z_th Y / (X − Y), σ_Z = |Z_th| √(σ_x² |Y|² + σ_y² |X|²) /
+|X − Y|², for the coefficients X of V_th and Y of V_out, to first order in their noise. `exact` ones
+have the noise of the scene, but no error of Z_th and no trigger delay, which no recording gives;
+etid's `identify_impedance` and its rule choose for these, too.
 """
 
 import math

@@ -189,7 +189,7 @@ def _fits(folder: pathlib.Path) -> tuple[bytes, ...]:
 def _use_fits(path: pathlib.Path, seed: int) -> None:
     def read() -> None:
         fits = etid.Fits.read(path)
-        void((str(fits), str(fits[0]), fits.table(), fits.summary("subject")))
+        "".join(map(str, (fits, fits[0], fits.table(), fits.summary("subject"))))
         fits.where(condition="dry").successful()
 
     def written() -> None:
@@ -230,18 +230,11 @@ def _use_import(path: pathlib.Path, seed: int) -> None:
     del seed
     names = {".tdms": ("rig/open", "rig/skin"), ".abf": ("channel 0", "channel 0")}
     v_th, v_out = names.get(path.suffix, ("open", "skin"))
-    said: dict[str, Any] = {"sample_rate": 2e5, "pulse_rate": 60.0, "scale": 0.0535}
-    target = path.with_suffix(".out")
-    if path.suffix == ".npz":
-        return void(etid.import_file(path, target))
-    mapping = {**said, "v_th": {"channel": v_th, "unit": "V"}, "v_out": {"channel": v_out}}
-    mapping["v_out"] |= {"unit": "V"}
-    return void(etid.import_file(path, target, mapping))
-
-
-def void(value: object) -> None:
-    """Nothing."""
-    del value
+    mapping: dict[str, Any] = {"sample_rate": 2e5, "pulse_rate": 60.0, "scale": 0.0535}
+    mapping["v_th"] = {"channel": v_th, "unit": "V"}
+    mapping["v_out"] = {"channel": v_out, "unit": "V"}
+    told = path.suffix == ".npz"  # such a file says all of it
+    etid.import_file(path, path.with_suffix(".out"), None if told else mapping)
 
 
 def _numbers() -> np.ndarray:

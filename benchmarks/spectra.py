@@ -68,12 +68,6 @@ def one_rc(rng: np.random.Generator) -> etid.SkinRC:
     return etid.SkinRC(share * total, r_p, 1 / (2 * np.pi * corner * r_p))
 
 
-def no_series(rng: np.random.Generator) -> etid.ParallelRC:
-    """Skin without R_s."""
-    skin = one_rc(rng)
-    return etid.ParallelRC(skin.r_p, skin.c_p)
-
-
 def spread(rng: np.random.Generator, alpha: tuple[float, float] = (0.6, 0.95)) -> etid.SkinCole:
     """Skin with a spread of time constants."""
     skin = one_rc(rng)
@@ -109,21 +103,19 @@ def exact(circuit: etid.AbstractCircuit) -> dict[str, tuple[float, float]]:
 
 def good(rng: np.random.Generator, points: int = POINTS) -> Spectrum:
     """A spectrum without a fault, and its circuit."""
-    circuit = (one_rc, no_series, spread, layers)[rng.integers(4)](rng)
+    kind = rng.integers(4)
+    circuit = (one_rc, one_rc, spread, layers)[kind](rng)
+    if kind == 1 and isinstance(circuit, etid.SkinRC):  # skin without R_s
+        circuit = etid.ParallelRC(circuit.r_p, circuit.c_p)
     f = frequencies(rng, points)
     return Spectrum(f, noisy(response(circuit, f), rng), type(circuit)(), exact(circuit))
 
 
-def wrong_sign(rng: np.random.Generator) -> Spectrum:
-    """−Im Z, as it is drawn, in place of Im Z."""
-    of = good(rng)
-    return dataclasses.replace(of, z=np.conj(of.z), truth={})
-
-
-def no_phase(rng: np.random.Generator) -> Spectrum:
-    """|Z| in place of Z."""
-    of = good(rng)
-    return dataclasses.replace(of, z=np.abs(of.z).astype(complex), truth={})
+def no_answer(
+    change: Callable[[np.ndarray], np.ndarray],
+) -> Callable[[np.random.Generator], Spectrum]:
+    """Impedances that are none of skin."""
+    return lambda rng: dataclasses.replace(of := good(rng), z=change(of.z), truth={})
 
 
 def wrong_unit(rng: np.random.Generator) -> Spectrum:
@@ -187,8 +179,8 @@ def beyond_range(rng: np.random.Generator) -> Spectrum:
 
 
 FAULTS: Mapping[str, Callable[[np.random.Generator], Spectrum]] = {
-    "wrong sign": wrong_sign,
-    "no phase": no_phase,
+    "wrong sign": no_answer(np.conj),  # -Im Z, as it is drawn, in place of Im Z
+    "no phase": no_answer(lambda z: np.abs(z).astype(complex)),  # |Z| in place of Z
     "wrong unit": wrong_unit,
     "wrong circuit": wrong_circuit,
     "drift": drift,

@@ -19,7 +19,6 @@ from benchmarks.machine import import_time, interpreter, median_time
 from benchmarks.peers import LOAD, SAMPLES, A, B, Problem, harmonics, problem
 from benchmarks.runner import QUICK, Target, report
 from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS
-from etid.signals.noise import noise_std
 
 PINNED = True
 PROCESSES = 3  # whose median counts
@@ -110,25 +109,11 @@ def fits(of: Problem, repeats: int) -> Iterator[Target]:
 
 def tick(electrodes: int, ticks: int) -> Target:
     """A tick on-line with its tests and the next command, against the time between two pulses."""
-    tracker, pulses = online.problem(electrodes, 0)
+    tracker, pulses = online.problem(electrodes)
     period = tracker.period / tracker.model.bands.sample_rate
     ratio = float(np.percentile(online.timed(tracker, pulses, ticks)[1], 99))
     name = f"tick of {electrodes} electrodes, p99 / period"
     return costs(name, ratio * period, period, online.TICK)
-
-
-def limits(of: Problem, repeats: int) -> str:
-    """What no fit can be faster than on this machine."""
-    record = of.records[0]
-    stored, v_out = [record.samples[name] for name in ("v_th", "v_out")], record.v_out
-    calls = {
-        "reading both records": lambda: [of.values for of in stored],
-        "one rfft": lambda: np.fft.rfft(v_out),
-        "one lfilter": lambda: scipy.signal.lfilter(B, A, v_out),
-        "the noise of one record": lambda: noise_std(v_out),
-    }
-    times = {name: 1e3 * median_time(call, 5 * repeats) for name, call in calls.items()}
-    return ", ".join(f"{name} {time:.2f} ms" for name, time in times.items())
 
 
 _FIRST = """
@@ -167,6 +152,4 @@ def main(arguments: argparse.Namespace) -> bool:
     for of in (solvers, from_samples, fits):
         targets += of(ten_periods, repeats)
     targets.append(tick(lanes, 20 * repeats if quick else 2000))
-    met = report(targets)
-    print(f"limits: {limits(ten_periods, repeats)}")
-    return met
+    return report(targets)

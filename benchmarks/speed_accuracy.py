@@ -9,10 +9,9 @@ apart, on one core. Before everything else rivals have their own environments
 import argparse
 import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -20,8 +19,8 @@ import etid
 from benchmarks import rivals
 from benchmarks.estimators import DEFAULT, ELEMENTS, NOTHING, OURS, Answer, Drivers, method_of
 from benchmarks.ladder import CALIBRATION, SOURCES, START, TRIAL, ladder
-from benchmarks.machine import make_room, write_csv
-from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report
+from benchmarks.machine import make_room, timed, write_csv
+from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report, show
 from benchmarks.speed_accuracy_chart import chart
 from etid.simulation.scenes import Scene
 
@@ -31,6 +30,10 @@ BUDGET = 6.0  # [s] for one estimator in one scene
 BATCH = 32  # recordings of a timed batch
 PATIENCE = 30  # budgets that a rival may take for all it has begun
 FEWEST = 4  # draws, however long they take
+PRINTED = (
+    *("scene", "estimator", "mode", "draws", "error", "none", "said", "wrong", "silent", "ms"),
+    *("first_s", "driver_ms", "on_front", "missing"),
+)
 SHOWN = ("dry, 80 dB", "dry, 60 dB", "dry, 30 dB", "damp, 60 dB", "damp, 40 dB", "dry, 1 MHz")
 FEW, FEW_REPETITIONS = ("dry, 60 dB", "damp, 40 dB"), 5
 SIGNIFICANT = 2.0  # standard errors of a paired difference
@@ -57,18 +60,17 @@ class Draws(NamedTuple):
     truth: np.ndarray
     bound: np.ndarray
 
+    @classmethod
+    def of(cls, scene: Scene, repetitions: int, source: Callable[[Scene, int], etid.Study]):
+        """Record a scene with one seed after the other, from 0 on."""
+        truth, bound = scene.truth()[TRIAL], etid.bound(scene)[TRIAL].relative
+        studies = [source(scene, seed) for seed in range(repetitions)]
+        return cls(studies, *(np.array(list(of.values())) for of in (truth, bound)))
+
     def answer(self, name: str, seed: int, verdict: str, value: Any, stderr: Any) -> Answer:
         """What an estimator says of a draw."""
         error, own = (np.asarray(of, float) / self.truth for of in (value, stderr))
         return Answer(name, seed, TRIAL, verdict, error - 1, own, self.bound)
-
-
-def draw(scene: Scene, repetitions: int, source: Callable[[Scene, int], etid.Study]) -> Draws:
-    """Record a scene with one seed after the other, from 0 on."""
-    bound = list(etid.bound(scene)[TRIAL].relative.values())
-    truth = list(scene.truth()[TRIAL].values())
-    studies = [source(scene, seed) for seed in range(repetitions)]
-    return Draws(studies, np.array(truth), np.array(bound))
 
 
 class Result(NamedTuple):
@@ -111,14 +113,7 @@ class Result(NamedTuple):
 
 
 def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[Result]:
-    """One of our estimators, alone and batched.
-
-    Args:
-        draws: The recordings.
-        drivers: Their drivers.
-        name: Of the estimator.
-        budget: Time [s] after which the other draws are left out, but for `FEWEST`.
-    """
+    """One of our estimators, alone and batched; after the budget [s] other draws are left out."""
     method, begin = method_of(name), np.inf
     answers, usable, times = [], [], []
     for seed, study in enumerate(draws.studies):
@@ -134,8 +129,8 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[R
             return etid.identify_skin(record, driver, method=method, throw=False)
 
         if not times:
-            times.append(_timed(identify)[0])  # it compiles
-        seconds, fit = _timed(identify)
+            times.append(timed(identify)[1])  # it compiles
+        fit, seconds = timed(identify)
         times.append(seconds)
         said = fit.circuit.values(), fit.stderr.values()
         answers.append(draws.answer(name, seed, fit.verdict, *said))
@@ -151,16 +146,10 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[R
         count = max(1, min(BATCH, round(budget / 3 / seconds)))
         batch = [usable[i % len(usable)][0] for i in range(count)]
         several = [
-            _timed(lambda: etid.identify_skins(batch, known, method=method))[0] for _ in range(3)
+            timed(lambda: etid.identify_skins(batch, known, method=method))[1] for _ in range(3)
         ]
         each = float(np.median(several[1:])) / count
         yield alone._replace(mode="batched", seconds=each, first_seconds=several[0])
-
-
-def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
-    begin = time.perf_counter()
-    found = jax.block_until_ready(call())
-    return time.perf_counter() - begin, found
 
 
 def theirs(draws: Draws, budget: float) -> Iterator[Result]:
@@ -189,7 +178,7 @@ def theirs(draws: Draws, budget: float) -> Iterator[Result]:
 
 def rows_of(name: str, source: str, repetitions: int, quick: bool) -> list[dict[str, Any]]:
     """One row for each estimator and mode in one scene; `quick` leaves out batches and rivals."""
-    draws, drivers = draw(ladder()[name], repetitions, SOURCES[source]), Drivers()
+    draws, drivers = Draws.of(ladder()[name], repetitions, SOURCES[source]), Drivers()
     modes = 1 if quick else None
     results = [
         result
@@ -267,21 +256,6 @@ def ranked(rows: Sequence[dict[str, Any]]) -> Iterator[Target]:
         yield from (target for target in found if not target.met)
 
 
-def _print(rows: Iterable[dict[str, Any]]) -> None:
-    for row in rows:
-        head = f"{row['scene']:<20}{row['estimator']:<31}{row['mode']:<8}"
-        numbers = "".join(
-            f"{unit * row[key]:9.{digits}f} {name}"
-            for key, unit, digits, name in (
-                ("error", 1, 2, "x bound"), ("none", 100, 0, "% none"), ("said", 100, 0, "% said"),
-                ("wrong", 100, 0, "% wrong"), ("silent", 100, 0, "% silent"), ("ms", 1, 2, "ms"),
-                ("first_s", 1, 2, "s first"), ("driver_ms", 1, 0, "ms driver"),
-            )
-        )  # fmt: skip
-        said = row["missing"] or numbers + "  front" * row["on_front"]
-        tqdm.write(f"{head}{row['draws']:>4}{said}")
-
-
 def main(arguments: argparse.Namespace) -> bool:
     """Print and write the table and the charts; whether the ranking of methods holds."""
     quick, folder = arguments.quick, arguments.folder
@@ -289,7 +263,8 @@ def main(arguments: argparse.Namespace) -> bool:
     table: list[dict[str, Any]] = []
     for name in tqdm(arguments.scene or list(FEW if quick else ladder()), unit="scene"):
         rows = rows_of(name, arguments.source, repetitions, quick)
-        _print(rows)
+        for row in rows:
+            show(row, *PRINTED)
         table += rows
         write_csv(folder / FILE, table)  # each scene is kept as it comes
         make_room()

@@ -17,7 +17,7 @@ import numpy as np
 
 import etid
 from benchmarks.machine import write_csv
-from benchmarks.runner import option
+from benchmarks.runner import option, show
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.registry import named, names
 from etid.simulation.scenes import Scene, Trial
@@ -75,7 +75,6 @@ OPTIONS = (
     option("--method", action="append", choices=ESTIMATORS, help="only this; repeatable"),
     option("-o", "--output", type=pathlib.Path, help="CSV to write"),
 )
-NUMBERS = ("bias", "spread", "rms", "bound", "sd", "chi2")
 
 
 @contextlib.contextmanager
@@ -146,10 +145,7 @@ def main(arguments: argparse.Namespace) -> bool:
         for method in arguments.method or ESTIMATORS:
             for row in fit_scene(folder / f"{name}.npz", truth[name], method):
                 table.append(row)
-                numbers = ", ".join(f"{key} {row[key]:.3g}" for key in NUMBERS)
-                head = f"{row['scene']:<19}{row['method']:<20}{row['element']:<5}"
-                said = f"silent {row['silent']}; driver {row['driver']}; {row['verdicts']}"
-                print(f"{head}{numbers}, {said}", flush=True)
+                show(row)
     if arguments.output is not None and table:
         write_csv(arguments.output, table)
     return True

@@ -3,13 +3,9 @@
 The records are those of `etid.simulation.bound`: X_k and Z_th(f_k) are unknown at every harmonic,
 and so are the elements and the delays. A change adds ε ∂Y_k to the loaded voltages, ε = 1 for the
 change itself. What of it those unknowns cannot imitate, over the noise, is the largest number of
-standard deviations d by which any test without a bias can see it. A driver of finite order is known
-better than this Z_th where it is smooth: one that is known up to the values of its parts would let
-a test see a gain at 1.03 d, and a slow filter at 1.2 to 1.6 d.
-
-By the lemma of Neyman and Pearson (1933), the test that refuses beyond `LIMIT` standard deviations
-of this change is the most powerful one with its rate of false alarms. `missed` is the probability
-that it does not refuse.
+standard deviations by which any test without a bias can see it. By the lemma of Neyman and Pearson
+(1933), the test that refuses beyond `LIMIT` of them is the most powerful one with its rate of false
+alarms. `missed` is the probability that it does not refuse.
 """
 
 import math
@@ -79,11 +75,7 @@ def information(
 ) -> Float[np.ndarray, "q q"]:
     """Fisher information of the elements' logarithms, both delays [µs], and the sizes of changes.
 
-    Args:
-        load: The skin.
-        snr_db: Of every record [dB].
-        band: Highest frequency, relative to the sample rate.
-        changes: What is added.
+    `band` is the highest frequency, relative to the sample rate.
     """
     scene = rung("dry", snr_db=snr_db)
     wave = scene.waveform()

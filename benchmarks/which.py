@@ -48,9 +48,14 @@ def table(rows: Sequence[Row]) -> str:
         cells = [_cell(of.get(method), method == use) for method in methods]
         name = use.replace("_", " ") if use else "none of them"
         lines.append(f"| {scene} | " + " | ".join(cells) + f" | {name} |")
-    times = [_median_ms(of_method[name]) for name in methods]
+    times, draws = [], []
+    for of in (of_method[name] for name in methods):
+        ms = [row["ms"] for row in of if row["mode"] == "batched" and np.isfinite(row["ms"])]
+        times.append(f"{np.median(ms):.3g}" if ms else "-")
+        ends = dict.fromkeys(int(end(row["draws"] for row in of)) for end in (min, max))
+        draws.append(" to ".join(map(str, ends)))
     lines.append("| *ms, in a batch* | " + " | ".join(times) + " | |")
-    lines.append("| *draws* | " + " | ".join(_draws(of_method[name]) for name in methods) + " | |")
+    lines.append("| *draws* | " + " | ".join(draws) + " | |")
     return "\n".join(lines) + "\n"
 
 
@@ -83,22 +88,8 @@ def _cell(row: Row | None, used: bool) -> str:
     return f"**{text}**" if used else text
 
 
-def _median_ms(rows: Sequence[Row]) -> str:
-    found = [row["ms"] for row in rows if row["mode"] == "batched" and np.isfinite(row["ms"])]
-    return f"{np.median(found):.3g}" if found else "-"
-
-
-def _draws(rows: Sequence[Row]) -> str:
-    least, most = (int(end(row["draws"] for row in rows)) for end in (min, max))
-    return f"{least}" if least == most else f"{least} to {most}"
-
-
 def inserted(text: str, made: str) -> str:
-    """A page with the table between its marks.
-
-    Raises:
-        ValueError: The page has no marks.
-    """
+    """A page with the table between its marks; a `ValueError` if it has none."""
     head, begin, rest = text.partition(BEGIN)
     _, end, tail = rest.partition(END)
     if not (begin and end):

@@ -1,13 +1,11 @@
 """What one would use instead of etid: other packages on the same recordings.
 
-Each rival is a module beside this one, written as a user of its package would write it, and run by
-`worker` in an environment of its own, of which as many are made as pins clash. A rival that cannot
-be installed or run is a row that says why (`benchmarks.rivals.table`).
+Each rival is a module beside this one, run by `worker` in an environment of its own, of which as
+many are made as pins clash. One that cannot be installed or run is a row that says why.
 
 Nothing but the standard library and NumPy is imported here: those environments have no etid.
 """
 
-import dataclasses
 import json
 import math
 import os
@@ -19,6 +17,7 @@ import sys
 import tempfile
 import venv
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -33,26 +32,23 @@ SETTINGS = {
     **{f"{of}_NUM_THREADS": "1" for of in ("OMP", "OPENBLAS", "MKL", "NUMBA")},
     "JAX_ENABLE_COMPILATION_CACHE": "0",
 }
+NONE = np.empty(0)
 
 
 class RivalError(RuntimeError):
     """A rival could not be run; says why in a line."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Outcome:
     """What a rival found, one row per draw, or why it found nothing."""
 
-    # R_s [ohm], R_p [ohm], C_p [F]; NaN where a draw failed
-    elements: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 3)))
-    # what the package says of its success
-    ok: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0, bool))
-    # of the skin's fit from its records, warm
-    seconds: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0))
-    # of the driver's fit
-    driver_seconds: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0))
+    elements: np.ndarray = field(default_factory=NONE.copy)  # [ohm, ohm, F]; NaN without an answer
+    ok: np.ndarray = field(default_factory=NONE.copy)  # what the package says of its success
+    seconds: np.ndarray = field(default_factory=NONE.copy)  # of the skin's fit, warm
+    driver_seconds: np.ndarray = field(default_factory=NONE.copy)  # of the driver's fit
     first_seconds: float = np.nan  # of the first fit of a skin, with what it compiles
-    versions: Mapping[str, str] = dataclasses.field(default_factory=dict)  # by package
+    versions: Mapping[str, str] = field(default_factory=dict)  # by package
     errors: Sequence[str] = ()  # message of each draw, mostly empty
     missing: str = ""  # one line that says why there is nothing; empty if there is
 
@@ -75,16 +71,13 @@ def _requirements(environment: str) -> tuple[pathlib.Path, pathlib.Path]:
 
 
 def install(names: Iterable[str]) -> dict[str, str]:
-    """Make the environments of some rivals of `RIVALS`; by environment why one could not be made.
-
-    An environment whose requirements have not changed since is left as it is.
-    """
+    """Make the environments of some rivals; by environment why one could not be made."""
     made = {name: make(name) for name in dict.fromkeys(RIVALS[one].environment for one in names)}
     return {environment: why for environment, why in made.items() if why}
 
 
 def make(environment: str) -> str:
-    """Make an environment; why it could not be made, or nothing."""
+    """Make an environment unless it is there; why it could not be made, or nothing."""
     if installed(environment):
         return ""
     wanted, made = _requirements(environment)
@@ -104,17 +97,10 @@ def exchange(
     timeout: float | None = None,
     **problem: Any,
 ) -> dict[str, np.ndarray]:
-    """What a module that calls `serve` makes of a problem, in a process of its own.
-
-    Args:
-        environment: In which it runs.
-        module: Its full name.
-        python: The interpreter; that of the environment if not given.
-        timeout: Longest time [s].
-        problem: Arrays.
+    """What a module that calls `serve` makes of arrays, in a process of its own.
 
     Raises:
-        RivalError: It failed, or took too long.
+        RivalError: It failed, or took longer than the timeout [s].
     """
     with tempfile.TemporaryDirectory() as folder:
         given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
@@ -160,13 +146,7 @@ def run(
 ) -> Outcome:
     """Run a rival on a problem, on one core, in a process of its own.
 
-    Args:
-        name: Module of `RIVALS`.
-        problem: The arrays that `worker` reads.
-        repeats: Fits of each skin, of which the median time counts.
-        timeout: Longest time for all of it [s].
-        budget: Time after which no further draw is begun [s].
-        python: The interpreter; that of the rival's environment if not given.
+    After the `budget` [s] no further draw is begun; the `timeout` [s] is that of all of it.
     """
     rival = RIVALS[name]
     if python is None and not installed(rival.environment):
@@ -191,12 +171,7 @@ def _last_error(text: str) -> str:
 
 
 def problem(pairs: Sequence[tuple[Any, Any]], start: Any) -> dict[str, Any]:
-    """Recordings of one rate, for `run`.
-
-    Args:
-        pairs: Each trial and its calibration, as `etid.Recording`.
-        start: Elements to start from, in SI.
-    """
+    """Trials with their calibrations, and elements to start from, for `run`."""
     trials, calibrations = zip(*pairs, strict=True)
     return {
         "v_th": np.stack([one.v_th for one in trials]),

@@ -4,7 +4,7 @@ PROBLEM holds `f` (harmonic,) [Hz]; `z` [ohm], its noise `sigma` = √E|noise|²
 harmonic is `used`, all (spectrum, harmonic). RESULT gets the Schwarz criterion `bic` (spectrum,
 circuit), infinite where the package gave up, and `seconds` (spectrum,) for all five fits. Units are
 MHz, kΩ and nF; the fits start at the typical values of etid. With the package's own tolerance,
-1e-13, and 1e5 steps, the criteria are the same and a spectrum takes two to three times as long.
+1e-13, the criteria are the same and a spectrum takes two to three times as long.
 """
 
 import time

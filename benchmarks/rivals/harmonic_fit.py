@@ -52,14 +52,7 @@ def skin(
 def skin_misfit(q: Any, f: Any, x: Any, y: Any, sigma: Any, z_th: Any, numpy: Any = np) -> Any:
     """Residuals (Y − G X) / (σ √(1 + |G|²)), real parts before imaginary ones: both are noisy.
 
-    Args:
-        q: Logarithms of R_s, R_p [ohm] and C_p [F], and the delay [µs].
-        f: Frequencies [Hz].
-        x: Coefficients of V_th [V].
-        y: Coefficients of V_out [V].
-        sigma: Their noise [V].
-        z_th: Source impedance [ohm].
-        numpy: The namespace to compute in.
+    q holds the logarithms of R_s, R_p [ohm] and C_p [F], and the delay [µs].
     """
     s = 2j * np.pi * f
     r_s, r_p, c_p = numpy.exp(q[0]), numpy.exp(q[1]), numpy.exp(q[2])

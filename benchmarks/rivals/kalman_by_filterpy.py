@@ -1,13 +1,10 @@
 """filterpy's extended Kalman filter with etid's model: `python -m ... PROBLEM RESULT`.
 
-The model is that of `etid.Tracker`: same bands, same circuit, same random walk, derivatives in
-closed form, one filter for each electrode as filterpy is made for. It is told the sampling phase of
-each pulse: an extended Kalman filter has no search over delays. It has no tests for changes and no
-verdicts. It gets the gains of the bands, so that its time is without that of the bands.
-
-PROBLEM holds gains and their variances (pulse, lane, band), known delays [samples] of the pulses,
-the bands, the standard deviation of the random walk, and logarithms of the elements to start from.
-RESULT gets the processor time of each pulse and the last logarithms.
+The model is that of `etid.Tracker`, with derivatives in closed form, and one filter for each
+electrode. It is told the sampling phase of each pulse and the gains of the bands, and has no tests
+for changes. PROBLEM holds gains and their variances (pulse, lane, band), delays [samples] of the
+pulses, the bands, the standard deviation of the random walk, and logarithms of the elements to
+start from. RESULT gets the processor time of each pulse and the last logarithms.
 """
 
 import time

@@ -71,16 +71,9 @@ def measured_driver(
 
 
 def load_impedance(of: Harmonics, z_th: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spectrum of a load where it and Z_th are known.
+    """Frequencies [Hz], impedances Z_L = Z_th Y / (X − Y) [ohm], and their standard deviations.
 
-    Z_L = Z_th Y / (X − Y), and what the noise of X and Y is in it.
-
-    Args:
-        of: Harmonics of the load's records.
-        z_th: Source impedance [ohm] at these; NaN where it is not known.
-
-    Returns:
-        Frequencies [Hz], impedances [ohm] and their standard deviations [ohm].
+    Z_th is NaN where it is not known.
     """
     use = of.visible & np.isfinite(z_th)
     f, x, y, z_th = of.f[use], of.x[use], of.y[use], z_th[use]
@@ -98,15 +91,10 @@ class Period(NamedTuple):
 
 
 def current_and_voltage(of: Harmonics, z_th: np.ndarray, delay: float = 0.0) -> Period:
-    """The skin's current, (X − Y) / Z_th, and voltage, Y, as one period in time.
+    """The skin's current, (X − Y) / Z_th, and voltage, Y, as one period; V_th is `delay` [µs] late.
 
     Only harmonics that noise leaves visible take part, and the period is sampled at `RATE` at
     least: so is noise kept out, and the error of a discrete-time model of the skin small.
-
-    Args:
-        of: Harmonics of the load's records.
-        z_th: Source impedance [ohm] at these; NaN where it is not known.
-        delay: By which V_th is to be late [µs].
     """
     use = of.visible & np.isfinite(z_th)
     x = of.x[use] * np.exp(-2j * np.pi * MICROSECOND * delay * of.f[use])

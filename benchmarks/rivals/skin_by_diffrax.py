@@ -1,17 +1,11 @@
 """diffrax's periodic response of `etid.SkinCurrent`: `python -m ... PROBLEM RESULT`.
 
-Its methods are those of its documentation for stiff equations (Kvaerno's, of order 5) and for
-others at narrow tolerances (Dormand and Prince's, of order 8), with step sizes by a PID controller
-and derivatives by forward mode. A current source is a formula, the best case of a solver that
-chooses its own times. V_th of a driver is known at times only; between them it is SciPy's cubic
-spline, which is far more exact than diffrax's Hermite polynomials.
-
-PROBLEM holds the logarithms of the elements, the times of the samples [s], the period [s], the
-number of periods until the response repeats (the last one counts), methods, tolerances, and a feed:
-the height of the current [A] with the begins and ends of its phases and the width of its edges [s],
-or V_th [V] at equal distances with the resistance and the inductance of the driver.
-RESULT gets for each method the voltage [V], the processor times of it alone and with its
-derivatives with respect to the logarithms, and the wall time of both first calls [s].
+Its methods are those of its documentation for stiff equations and for narrow tolerances, with step
+sizes by a PID controller and derivatives by forward mode. A current source is a formula, the best
+case of a solver that chooses its own times. V_th is known at times only; between them it is SciPy's
+cubic spline, which is far more exact than diffrax's Hermite polynomials. `benchmarks.amplitudes`
+makes the problem. RESULT gets for each method the voltage [V], the processor times of it alone and
+with its derivatives with respect to the logarithms, and the wall time of both first calls [s].
 """
 
 import time

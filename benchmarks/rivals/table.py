@@ -1,8 +1,5 @@
 """What one would use instead of etid: other packages on the same recordings.
 
-    python -m benchmarks rivals              installs all, and runs each where it should work
-    python -m benchmarks rivals scipy_harmonics jaxopt_lm
-
 Printed is for each: installed or why not, and errors and times where it should work.
 """
 

@@ -1,12 +1,10 @@
 """Runs one rival: `python -m benchmarks.rivals.worker PROBLEM RESULT`.
 
-PROBLEM holds `name`, a module beside this one, run by the Python of its own environment. It has
-`skin` for one record and Z_th as measured, or `fit` for the residuals of `harmonic_fit`, or `batch`
-of an estimator for all of a problem at once. Besides: `v_th`,
-`v_out`, `ref_th`, `ref_out` (draw, sample) [V], `r_ref` (draw,) [ohm], `start` (3,) in SI, `fs`,
-`f0` [Hz], `repeats`, and `budget` [s], after which no further draw is begun, but for the second; a
-first fit that took as long is the only one. RESULT gets the fields of `rivals.Outcome`, `versions`
-and `errors` as JSON.
+PROBLEM is that of `rivals.run`; its `name` is a module beside this, run by the Python of its own
+environment, which has `skin` for one record and Z_th as measured, or `fit` for the residuals of
+`harmonic_fit`, or `batch` of an estimator for all of a problem at once. After the `budget` [s] no
+further draw is begun, but for the second; a first fit that took as long is the only one. RESULT
+gets the fields of `rivals.Outcome`, `versions` and `errors` as JSON.
 """
 
 import functools
@@ -27,17 +25,13 @@ from benchmarks.rivals.roster import RIVALS
 FEWEST = 2  # draws
 
 
-def methods(rival):
-    """What identifies a driver and a skin by a rival."""
-    if hasattr(rival, "fit"):
-        each = harmonic_fit.driver, harmonic_fit.skin
-        return [functools.partial(one, rival.fit) for one in each]
-    return measured_driver, rival.skin
-
-
 def results(rival, problem, repeats, budget):
     """All draws, one after the other; what fails costs its own draw alone."""
-    driver, skin = methods(rival)
+    if hasattr(rival, "fit"):
+        driver = functools.partial(harmonic_fit.driver, rival.fit)
+        skin = functools.partial(harmonic_fit.skin, rival.fit)
+    else:
+        driver, skin = measured_driver, rival.skin
     fs, f0, start = float(problem["fs"]), float(problem["f0"]), problem["start"]
     draws = len(problem["r_ref"])
     found = {
