@@ -52,7 +52,7 @@ def test_a_resistor_of_another_unit_makes_an_implausible_driver(calibrations, r_
     calibration = calibrations[0].replace(r_load=r_load)
     with pytest.raises(
         etid.IdentificationError,
-        match=r"implausible, \|Z_th\| is .* ohm at 1 kHz.*Is r_load in ohm",
+        match=r"implausible, \|Z_th\| is .* ohm at 1 kHz.*r_load is not in ohm",
     ):
         etid.identify_driver(calibration)
     believed = etid.identify_driver(calibration, plausible=(0.0, np.inf))

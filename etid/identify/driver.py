@@ -125,7 +125,7 @@ def calibrated(
         driver = _of_least_order(seen, estimator)
     else:
         driver = _driver(seen, options.order, estimator)
-    for one in seen:
+    for one in seen if LOG.isEnabledFor(logging.INFO) else ():
         log_changes(one)
     remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
     driver = dataclasses.replace(driver, remarks=np.asarray(int(remarks) | int(driver.remarks)))

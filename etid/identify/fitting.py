@@ -51,12 +51,8 @@ FEWEST = 16  # recordings that are read and fitted at once, however long they ar
 HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least `FEWEST`
 SPARSE = 16  # every 16th sample enters a checksum
 KEPT = 4  # drivers, for which `known_of` is kept
-NOTED = (
-    "changed",
-    "misfit",
-    "out_of_bounds",
-    "inconsistent",
-)  # verdicts to whose message a note adds
+# Verdicts to whose message a note adds.
+NOTED = ("changed", "misfit", "out_of_bounds", "inconsistent")
 _Outcome = TypeVar("_Outcome", Fit, Driver)
 
 
@@ -419,7 +415,8 @@ def notes_of(fits: Fit) -> list[str]:
 
 def remarks_on(seen: Inspected, estimator: AbstractEstimator) -> int:
     """Remarks on a recording, also that the estimator leaves out a current beside a driver."""
-    log_changes(seen)
+    if LOG.isEnabledFor(logging.INFO):
+        log_changes(seen)
     uses = isinstance(estimator, MaximumLikelihood) and estimator.with_current
     unused = seen.by_current is not None and not uses
     return int(seen.remarks | (Remark.current_unused if unused else 0))

@@ -14,8 +14,6 @@ LOG = logging.getLogger("etid")
 
 def log_changes(inspected: Inspected) -> None:
     """Log how a recording was changed before its fit."""
-    if not LOG.isEnabledFor(logging.INFO):
-        return
     lines = [how_shifted(inspected)]
     if inspected.kept is not None:
         whole, spacing = inspected.whole_periods[0], inspected.spacing
