@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("run_as_for_users")
 def compiled(monkeypatch):
     """One program for dozens of fits: by all passes of XLA, each takes a sixth of the time."""
     monkeypatch.setattr(tiers, "_by_numpy", lambda: False)
-    monkeypatch.setattr(tiers, "AT_ONCE", None)
+    monkeypatch.setattr(tiers, "AT_ONCE", {})
 
 
 def pulses(t: np.ndarray) -> np.ndarray:
