@@ -113,8 +113,8 @@ for day in ("d1", "d2"):
 print(drivers["d2"])
 
 # %% [markdown]
-# While a display runs, `etid live driver_d1.h5 --socket localhost:5555` shows these maps in the browser, and a button
-# stops it.
+# While a display runs, `etid live driver_d1.h5 --socket localhost:5555` shows these maps in the
+# browser, and a button stops it.
 #
 # ## From the folder to one file
 # The names of the files hold the labels, and `CH3` the electrode. The calibration of a day belongs

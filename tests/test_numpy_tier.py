@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from jax import lax
 
 from etid.numpy_tier import UntranslatableError, translated
 from etid.numpy_tier.primitives import RULES
+from etid.numpy_tier.translator import written
 
 EPSILON = {"f": 8, "c": 16}  # roundings of both results; complex products add two of them
 REAL = (np.float64, np.float32)
@@ -432,3 +434,26 @@ def test_a_program_does_not_change_its_operands():
     x = X.copy()
     translated(jax.make_jaxpr(lambda x: x.at[0].set(0.0).at[:, 1].add(1.0))(x))([x])
     np.testing.assert_array_equal(x, X)
+
+
+def test_what_does_not_change_is_computed_before_the_loop():
+    text, _ = written(jax.make_jaxpr(recursion)(X[0]))
+    inside = [line for line in text.splitlines() if line.startswith("  ")]  # of the step
+    assert "=exp" in text
+    assert inside
+    assert not any("=exp" in line for line in inside)
+
+
+def test_memory_does_not_grow_with_the_length_of_a_program():
+    def chain(x):
+        for _ in range(30):
+            x = jnp.sin(x)
+        return x
+
+    x = np.ones(100_000)
+    run = translated(jax.make_jaxpr(chain)(x))
+    tracemalloc.start()
+    run([x])
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 4 * x.nbytes

@@ -14,7 +14,7 @@ import etid
 from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_at
-from etid.online import alarms
+from etid.online import alarms, tick
 from etid.online.tracker import Tracker
 from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
@@ -540,3 +540,83 @@ def test_the_last_code_of_the_converter_is_clipped_and_the_one_before_is_not():
             verdicts = tracker.read(tracker.update(tracker.start(), pulse)).verdicts
             assert (verdicts[1] == "saturated") == clipped, (end, sample)
             assert verdicts[0] == "successful"
+
+
+def test_skin_that_jumps_is_found_with_the_first_pulse_after_it():
+    tracker = tracker_of(2)
+    pulses = with_noise(np.tile(tracker.pulses(loaded(quiet())), (3, 1, 1)), seed=2)
+    pulses[15:] = pulses[15:, ::-1].copy()
+    state = followed(tracker, pulses[:15])
+    assert tracker.changes(state) == []
+    for v_out in pulses[15:]:
+        state = tracker.update(state, v_out)
+        if int(state.number) == 16:
+            found = tracker.changes(state)
+            assert [(one.electrode, one.kind, one.pulse) for one in found] == [
+                (0, "jump", 16),
+                (1, "jump", 16),
+            ]
+        else:
+            assert tracker.changes(state) == []
+        fits = tracker.read(state)
+        assert set(fits.verdicts) == {"successful"}
+        z = (np.asarray(fits.circuit.values()) - TRUTH[::-1]) / np.asarray(fits.stderr.values())
+        assert (np.abs(z) < 4).all()
+
+
+def test_innovations_of_constant_and_wandering_skin_have_the_distribution_of_the_tests():
+    """The Kalman filter of a linear scene: T and Q exceed the 1 % point of chi-squared in 1 %."""
+    lanes, pulses, elements, walked = 512, 60, 3, 0.3
+    rng = np.random.default_rng(4)
+    root = rng.standard_normal((elements, elements))
+    told = root @ root.T + np.eye(elements)
+    spread = np.linalg.inv(told)
+    noise = rng.standard_normal((pulses, lanes, elements)) @ np.linalg.cholesky(spread).T
+    truth = np.cumsum(walked * rng.standard_normal((pulses, lanes, elements)), axis=0)
+    seen = truth + noise
+
+    @jax.vmap
+    def step(carry, d):
+        estimate, information, mean, cov = carry
+        before = tick.predicted(information, jnp.asarray(walked))
+        new = alarms.Innovation.of(d - estimate, jnp.asarray(spread), before)
+        moving = alarms.averaged(mean, cov, new)
+        after = before + told
+        estimate = estimate + jnp.linalg.solve(after, jnp.asarray(told) @ new.d)
+        carry = estimate, after, moving.d, moving.cov
+        return carry, jnp.stack([new.statistic(), moving.statistic()])
+
+    cov = jnp.zeros((lanes, elements, elements))
+    first = jnp.asarray(seen[0]), jnp.broadcast_to(told, cov.shape), jnp.zeros((lanes, 3)), cov
+    _, tests = jax.lax.scan(step, first, jnp.asarray(seen[1:]))
+    limit = scipy.stats.chi2.isf(0.01, elements)
+    share = (np.asarray(tests) > limit).mean(axis=(0, 1))
+    # T is independent from pulse to pulse; Q of about 20 pulses counts as one.
+    number = np.array([1.0, 1 / 20]) * lanes * (pulses - 1)
+    assert (np.abs(share - 0.01) < 4 * np.sqrt(0.01 / number)).all(), share
+
+
+def test_an_electrode_whose_search_diverged_is_identified_by_the_next_pulse():
+    """e^800 is no number: behind a short circuit a search goes there."""
+    tracker, _, clean = ten()
+    start = tracker.start()
+    far = np.array(start.electrodes.own)
+    far[:3, :3], far[3, :3] = 800.0, np.nan
+    own = jax.device_put(jnp.asarray(far), start.electrodes.own.sharding)
+    start = dataclasses.replace(start, electrodes=dataclasses.replace(start.electrodes, own=own))
+    found = tracker.read(tracker.update(start, with_noise(clean[8], seed=2)))
+    assert set(found.verdicts) == {"successful"}
+
+
+def test_a_residual_that_noise_makes_once_in_a_thousand_pulses_is_no_misfit():
+    """A pulse has 74 degrees of freedom: its χ² exceeds 1.5 in one of three hundred."""
+    tracker, state, clean = ten()
+    noise = 10 * (with_noise(clean[8], seed=5) - clean[8])  # 40 dB
+    verdicts = {}
+    for factor in (1.2, 2.5):
+        of_pulse = np.where(np.arange(3333) < 400, factor, 1.0)
+        found = tracker.update(state, clean[8] + of_pulse * noise)
+        verdicts[factor] = list(tracker.read(found).verdicts)
+        assert (found.electrodes.chi2 > 1.5).any()
+    assert verdicts[1.2] == ["successful"] * TEN
+    assert verdicts[2.5] == ["misfit"] * TEN
