@@ -167,7 +167,7 @@ def shares_of(row: Mapping[str, Any]) -> dict[str, float]:
 
 
 def draw(rows: Rows, path: pathlib.Path) -> None:
-    """Draw one map from its rows of the table: a bar for each cell, a panel for each method."""
+    """Draw one map from its rows of the table: a bar for each cell, a panel for equal methods."""
     panels: dict[str, dict[str, dict[str, float]]] = {}
     texts: dict[tuple[str, str], str] = {}
     for row in rows:
@@ -176,6 +176,10 @@ def draw(rows: Rows, path: pathlib.Path) -> None:
         shares = panels.setdefault(method, {})[cell] = shares_of(row)
         if shares["silent"] > 0:
             texts[method, cell] = f"{100 * shares['silent']:.1f} % silent"
+    equal = {str(of): [name for name in panels if panels[name] == of] for of in panels.values()}
+    panels = {", ".join(names): panels[names[0]] for names in equal.values()}
+    named = {name: ", ".join(names) for names in equal.values() for name in names}
+    texts = {(named[method], cell): text for (method, cell), text in texts.items()}
     title = f"{rows[0]['map']} (largest bound of an element): share of the answers"
     charts.shares(panels, charts.ANSWERS, path, title=title, texts=texts)
 
