@@ -299,6 +299,7 @@ def test_subjects_lie_in_the_published_ranges_and_differ(condition, ranges):
         (lambda: Scene((), (Trial("c", DRY),)), "needs a ResistorLoad"),
         (lambda: Scene(sample_rate=0.0), "sample_rate is 0"),
         (lambda: Scene(full_scale=np.inf), "full_scale is inf"),
+        (lambda: Scene(antialias=80e3), "relative to sample_rate"),
         (lambda: Scene(trigger_jitter_rms=-1e-9), "must not be negative"),
         (lambda: Scene(samples=0), "at least one"),
         (lambda: Scene(bits=1), "2 to 32"),

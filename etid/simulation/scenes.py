@@ -157,6 +157,11 @@ class Scene:
             value = getattr(self, name)
             if not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"{name} is {value}; it must be positive and finite")
+        if self.antialias > 20:  # the number of harmonics grows with it
+            raise ValueError(
+                f"antialias is {self.antialias}; it is relative to sample_rate, at most 20, where "
+                "the filter passes all that a pulse has"
+            )
         for name in ("snr_db", "current_snr_db"):
             value = getattr(self, name)
             if value is not None and not value > -math.inf:
