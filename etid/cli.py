@@ -197,10 +197,9 @@ class _Completion(argparse.Action):
         try:
             import shtab
         except ImportError:
-            parser.error(
-                "--completion needs shtab: pip install 'etid[completion]' "
-                "(in a clone: '.[completion]')"
-            )
+            from etid.recordings.errors import install
+
+            parser.error(f"--completion needs shtab: {install('completion')}")
         _complete_paths(parser, shtab.FILE)
         print(shtab.complete(parser, shell))
         parser.exit()

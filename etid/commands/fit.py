@@ -19,7 +19,7 @@ from etid.identify.arguments import order_of
 from etid.identify.file import fit_file, kept, processes
 from etid.identify.jointly import identify_jointly
 from etid.recordings import hdf5
-from etid.recordings.errors import RecordingError
+from etid.recordings.errors import RecordingError, install
 from etid.recordings.replacing import HDF5, claimed
 from etid.report.html import Table
 from etid.results.driver import Order
@@ -273,9 +273,7 @@ def _executor(arguments: argparse.Namespace) -> Iterator[concurrent.futures.Exec
         try:
             import distributed
         except ImportError as error:
-            raise ValueError(
-                "--dask needs distributed: pip install 'etid[dask]' (in a clone: '.[dask]')"
-            ) from error
+            raise ValueError(f"--dask needs distributed: {install('dask')}") from error
         with distributed.Client(arguments.dask) as client:
             yield client.get_executor()
     elif arguments.workers:

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from etid.recordings import errors
-from etid.recordings.errors import RecordingError
+from etid.recordings.errors import RecordingError, install
 
 BLOCK = 1 << 20  # [samples] size of a block in memory, 8 MB of real numbers
 
@@ -197,7 +197,7 @@ def optional(module: str, extra: str, file: str, package: str = "") -> Any:
         raise RecordingError(
             f"needs the package {package or module}",
             file=file,
-            remedy=f"Run pip install 'etid[{extra}]' (in a clone: '.[{extra}]')",
+            remedy=f"Run {install(extra)}",
         ) from error
 
 

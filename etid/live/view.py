@@ -21,8 +21,9 @@ from etid.circuits.display import DISPLAY, heading
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.controller import Controller
 from etid.online.pulse_fit import GainModel
-from etid.plotting.layout import Layout
+from etid.plotting.layout import COLUMNS, PITCH, Layout
 from etid.precision import in_float64
+from etid.recordings.errors import install
 from etid.results.verdicts import verdict_names
 
 if TYPE_CHECKING:
@@ -32,7 +33,6 @@ PORT = 8765
 EVERY = 0.1  # [s] between two snapshots
 LATEST = 1.0  # [s] after which a snapshot does not wait for a quick tick
 LAST = 0.5  # [s] that the windows have to see the last one
-COLUMNS = 7  # electrodes in a row of the paper's display
 ALARMS = 12  # alarms that are listed
 NAMED = 6  # electrodes that an alarm names
 GOOD, UNKNOWN = "good", "not identified: too_short"
@@ -72,9 +72,7 @@ class LiveView:
                 is in use or no port.
         """
         if importlib.util.find_spec("tornado") is None:
-            raise ValueError(
-                "the live view needs tornado: pip install 'etid[live]', in a clone '.[live]'"
-            )
+            raise ValueError(f"the live view needs tornado: {install('live')}")
         from etid.live.server import Slot, serve  # here, because it imports tornado
 
         if not 0 <= port < 2**16:
@@ -253,5 +251,5 @@ def _undelayed(model: GainModel, own: Float[Array, " own"]) -> Complex[Array, " 
 
 def _rows(electrodes: int) -> Layout:
     """Electrodes in rows as those of the paper's display."""
-    whole = Layout.grid(-(-electrodes // COLUMNS), COLUMNS, 2e-3)
+    whole = Layout.grid(-(-electrodes // COLUMNS), COLUMNS, PITCH)
     return Layout(whole.electrodes[:electrodes], whole.x[:electrodes], whole.y[:electrodes])

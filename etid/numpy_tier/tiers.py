@@ -125,15 +125,16 @@ def program(
 
 def _known(options: dict[str, Any]) -> dict[str, Any]:
     """Those of the options that this version of XLA has; others would end the compilation."""
+    return {name: value for name, value in options.items() if _is_known(name, value)}
 
-    def is_known(name: str) -> bool:
-        try:
-            jax.jit(lambda: 0, compiler_options={name: options[name]}).lower().compile()
-        except jax.errors.JaxRuntimeError:
-            return False
-        return True
 
-    return {name: value for name, value in options.items() if is_known(name)}
+@functools.cache  # it compiles
+def _is_known(name: str, value: bool | int | str) -> bool:
+    try:
+        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def worth_compiling(numbers: int) -> bool:

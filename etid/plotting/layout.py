@@ -12,6 +12,8 @@ from jaxtyping import Float
 from etid.recordings.errors import RecordingError, located, require_file
 from etid.recordings.tables import rows_of
 
+COLUMNS, PITCH = 7, 2e-3  # electrodes in a row of the paper's display, and their distance [m]
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Layout:
@@ -74,7 +76,7 @@ class Layout:
         return np.array([rows[str(name)] for name in names], int)
 
 
-FINGERTIP = Layout.grid(14, 7, 2e-3)
+FINGERTIP = Layout.grid(14, COLUMNS, PITCH)
 """The paper's display: 98 electrodes, 2 mm apart, on 26 x 12 mm²."""
 
 _MICROMETRE = 1e-6

@@ -108,3 +108,8 @@ def near_miss(name: str, known: Iterable[str]) -> str | None:
 
 def _simple(name: str) -> str:
     return name.lower().replace("_", "").replace("-", "").replace(" ", "")
+
+
+def install(extra: str) -> str:
+    """What installs an extra of etid, as the remedy of a package that is missing."""
+    return f"pip install 'etid[{extra}]' (in a clone: '.[{extra}]')"

@@ -14,6 +14,7 @@ from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.circuits.display import heading
 from etid.circuits.lookup import class_path
 from etid.circuits.overview import Overview, Overviewed, element_rows
+from etid.recordings.errors import install
 from etid.recordings.fields import DESCRIBING, Label, wanted_labels
 from etid.results.fit import Fit
 from etid.results.fits_columns import DESCRIBED, LABELS, LIMITS, SCHEMA, columns_of, long_form
@@ -158,8 +159,7 @@ class Fits(Overviewed, Generic[Circuit]):
         try:
             import pandas
         except ImportError as error:
-            install = "pip install 'etid[table]' (in a clone: '.[table]')"
-            raise ImportError(f"to_pandas needs pandas: {install}") from error
+            raise ImportError(f"to_pandas needs pandas: {install('table')}") from error
         return pandas.DataFrame(self.table(long=long))
 
     def summary(self, *by: str) -> list[dict[str, Any]]:
