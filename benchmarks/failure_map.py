@@ -169,17 +169,18 @@ def shares_of(row: Mapping[str, Any]) -> dict[str, float]:
 def draw(rows: Rows, path: pathlib.Path) -> None:
     """Draw one map from its rows of the table: a bar for each cell, a panel for equal methods."""
     panels: dict[str, dict[str, dict[str, float]]] = {}
-    texts: dict[tuple[str, str], str] = {}
     for row in rows:
         method = row["method"].replace("_", " ")
         cell = f"{row['row']}, {row['column']} ({100 * float(row['largest_bound']):.2g} %)"
-        shares = panels.setdefault(method, {})[cell] = shares_of(row)
-        if shares["silent"] > 0:
-            texts[method, cell] = f"{100 * shares['silent']:.1f} % silent"
+        panels.setdefault(method, {})[cell] = shares_of(row)
     equal = {str(of): [name for name in panels if panels[name] == of] for of in panels.values()}
     panels = {", ".join(names): panels[names[0]] for names in equal.values()}
-    named = {name: ", ".join(names) for names in equal.values() for name in names}
-    texts = {(named[method], cell): text for (method, cell), text in texts.items()}
+    texts = {
+        (name, cell): f"{100 * shares['silent']:.1f} % silent"
+        for name, of in panels.items()
+        for cell, shares in of.items()
+        if shares["silent"] > 0
+    }
     title = f"{rows[0]['map']} (largest bound of an element): share of the answers"
     charts.shares(panels, charts.ANSWERS, path, title=title, texts=texts)
 
