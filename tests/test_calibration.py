@@ -1,6 +1,7 @@
 import dataclasses
 import hashlib
 
+import jax
 import numpy as np
 import pytest
 
@@ -96,9 +97,24 @@ def test_a_file_without_calibrations_is_refused(scene, tmp_path, capsys):
     assert "holds no recording with a known resistor" in capsys.readouterr().err
 
 
+def test_a_driver_is_written_with_its_calibrations_and_read_again(scene, tmp_path):
+    calibration = scene.simulate(seed=0)["calibration/98k8"]
+    driver = etid.identify_driver(calibration, method="equation_error", throw=False)
+    driver.write(tmp_path / "driver.h5")
+    with etid.read(tmp_path / "driver.h5") as study:
+        [stored] = study.calibrations.recordings()
+    np.testing.assert_array_equal(stored.v_out, calibration.v_out)
+    again = etid.read_driver(tmp_path / "driver.h5", order=5)
+    known = etid.identify_driver(calibration)
+    np.testing.assert_array_equal(again.response(np.array([1e3])), known.response(np.array([1e3])))
+    mapped = jax.tree.map(lambda leaf: leaf, driver)
+    with pytest.raises(ValueError, match=r"write the one that etid\.identify_driver"):
+        mapped.write(tmp_path / "mapped.h5")
+
+
 def test_a_file_is_fitted_with_the_driver_of_another(scene, today, tmp_path, capsys):
     source, driver, fits = (tmp_path / name for name in ("day.h5", "driver.h5", "fits.h5"))
-    today.write(driver)
+    today.driver.write(driver)
     day = [one for one in scene.simulate(seed=3).loaded.recordings()][:3]
     etid.Study.from_recordings(one.replace(calibration=()) for one in day).write(source)
     assert main(["fit", str(source), "--driver", str(driver), "-o", str(fits)]) == 0

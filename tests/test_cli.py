@@ -277,10 +277,11 @@ def test_json_of_fit_has_what_the_text_has(run, study_file, tmp_path):
 def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
     run, study_file, tmp_path, monkeypatch
 ):
-    [driver] = study_fits().drivers.values()
-    monkeypatch.setattr(
-        calibrate, "calibrate", lambda of, former: CheckedCalibration(driver, of, [1e-3], {})
-    )
+    def calibrated(records, former):
+        driver = etid.identify_driver(records, method="equation_error", throw=False)
+        return CheckedCalibration(driver, records, [1e-3], {})
+
+    monkeypatch.setattr(calibrate, "calibrate", calibrated)
     page = (pathlib.Path(__file__).parents[1] / "docs" / "command_line.md").read_text("utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", page, flags=re.MULTILINE))
     assert rows.keys() == cli.COMMANDS.keys()
@@ -328,6 +329,9 @@ def test_verbose_says_on_stderr_what_is_done(run, study_file, tmp_path):
     assert status == DONE
     assert any(re.match(r"calibration/98k8: Driver of order 5", line) for line in said)
     assert sum("SkinRC: successful" in line for line in said) == 3
+    command = ("fit", study_file, "-o", tmp_path / "fits.h5", "--force", "--workers", 2)
+    _, _, also = run("--verbose", *command)
+    assert sorted(also) == sorted(said)  # what worker processes log is shown, too
     again = run("fit", study_file, "-o", tmp_path / "fits.h5", "--force")
     assert again == (DONE, printed, [])
 

@@ -117,10 +117,14 @@ def test_elements_are_those_without_hum(records, quiet, frequency):
     kept_numbers.check(f"hum_{frequency:g}_hz", kept_numbers.of_fit(fit))
 
 
-def test_hum_in_a_batch_costs_the_other_recordings_nothing(records, quiet):
+def test_hum_in_a_batch_costs_the_other_recordings_nothing(records, quiet, caplog):
     driver, fit = quiet
     loud = hummed(records[1], 60.0, 0.02, signals=("v_out",))
-    fits = etid.identify_skins([records[1], loud, records[1]], driver)
+    with caplog.at_level("INFO", "etid"):
+        fits = etid.identify_skins([records[1], loud, records[1]], driver)
+    again = [line for line in caplog.messages if "fitted again" in line]
+    assert len(again) == 1
+    assert again[0].endswith("without the mains harmonics; the second fit is kept.")
     alone = etid.identify_skins([records[1]], driver)  # the program of a single fit is another one
     np.testing.assert_array_equal(fits.fit.remarks, [0, Remark.mains_hum, 0])
     assert set(fits.verdicts) == {"successful"}

@@ -1,7 +1,7 @@
 import dataclasses
-import json
 
 import numpy as np
+import probeinterface
 import pytest
 from matplotlib.collections import EllipseCollection
 
@@ -74,8 +74,9 @@ def test_refusals_of_a_map(display, element, layout, message):
 def test_a_layout_is_read_from_a_table_or_a_probe_file(tmp_path):
     table, probe = tmp_path / "display.csv", tmp_path / "display.json"
     table.write_text("electrode, x, y\nA, 0, 0.001\nB, 0.002, 0\n", "utf-8")
-    content = {"contact_positions": [[0, 1], [2, 0]], "contact_ids": ["A", "B"], "si_units": "mm"}
-    probe.write_text(json.dumps({"probes": [content]}), "utf-8")
+    contacts = probeinterface.Probe(ndim=2, si_units="mm")
+    contacts.set_contacts([[0, 1], [2, 0]], contact_ids=["A", "B"])
+    probeinterface.write_probeinterface(probe, contacts)
     for path in (table, probe):
         layout = read_layout(path)
         assert layout.electrodes == ("A", "B")
@@ -89,7 +90,8 @@ def test_a_layout_is_read_from_a_table_or_a_probe_file(tmp_path):
         ("a.csv", "electrode,x,y\nA,1,1\nA,2,2\n", "these electrodes twice: A"),
         ("a.csv", "electrode,x,y\nA,1,far\n", "cannot be read .*far"),
         ("a.csv", "electrode,x,y\nA,1,nan\n", "needs a finite place"),
-        ("a.json", "{}", "one probe of probeinterface"),
+        ("a.json", '{"probes": [], "version": "0.4"}', "must hold one planar probe"),
+        ("a.json", "{}", "cannot be read"),
         ("a.json", "{", "cannot be read"),
     ],
 )

@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.former is not None:
         drivers[arguments.former.stem] = read_driver(arguments.former)
     found = calibrate(records, former=next(iter(drivers.values()), None))
-    found.write(arguments.target)
+    found.driver.write(arguments.target)
     if arguments.picture is not None:
         save(figure_of({arguments.target.stem: found.driver} | drivers), arguments.picture)
     data = {

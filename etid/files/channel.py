@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import importlib
 import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, BinaryIO, NamedTuple
@@ -10,7 +9,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from etid.recordings import errors
-from etid.recordings.errors import RecordingError, install
+from etid.recordings.errors import RecordingError
 
 BLOCK = 1 << 20  # [samples] size of a block in memory, 8 MB of real numbers
 
@@ -180,25 +179,6 @@ def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
 
 # For a block that reads a file of another format: its errors become a RecordingError of this place.
 located = functools.partial(errors.located, foreign=Exception)
-
-
-def optional(module: str, extra: str, file: str, package: str = "") -> Any:
-    """A module of a package that only users of one format need.
-
-    Args:
-        module: Name of the module.
-        extra: Extra of etid that installs the package.
-        file: The file that needs it.
-        package: Name of the package if it is not that of the module.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise RecordingError(
-            f"needs the package {package or module}",
-            file=file,
-            remedy=f"Run {install(extra)}",
-        ) from error
 
 
 # --- Units in the spellings of instrument files ---------------------------------------------------

@@ -15,10 +15,10 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.netlist import circuit_string, netlist
-from etid.files.channel import listed, optional
+from etid.files.channel import listed
 from etid.precision import in_float64
 from etid.recordings import limits
-from etid.recordings.recording import RecordingError
+from etid.recordings.errors import RecordingError, optional
 from etid.recordings.replacing import replace_text, replacing
 from etid.recordings.untrusted import attribute, translated
 from etid.results.fit import Fit

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.files.assemble import Imported, sources_of
-from etid.files.channel import Channel, Contents, located, optional
+from etid.files.channel import Channel, Contents, located
 from etid.files.mapping import (
     CHANNELS,
     KINDS,
@@ -27,7 +27,7 @@ from etid.files.mapping import (
     read_mapping,
 )
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
-from etid.recordings.errors import require_file
+from etid.recordings.errors import optional, require_file
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import AbstractSource, RecordingError, check_rates
 from etid.recordings.study import Study, refuse_nested

@@ -82,16 +82,16 @@ def identify_driver(
         driver_drift=driver_drift,
         instrument=instrument,
     )
-    return calibrated(calibrations, options, throw)
-
-
-def calibrated(
-    calibrations: Recording | Sequence[Recording], options: Options, throw: bool
-) -> Driver:
-    """`identify_driver` with options that are checked."""
-    asked = options.estimator
     single = isinstance(calibrations, Recording)
     records = recordings("calibrations", [calibrations] if single else calibrations)
+    driver = calibrated(records, options, throw)
+    object.__setattr__(driver, "recordings", tuple(records))  # the module is frozen
+    return driver
+
+
+def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> Driver:
+    """`identify_driver` with arguments that are checked."""
+    asked = options.estimator
     if not records:
         raise ValueError(
             "no calibration given; a driver needs at least one record with a known r_load"

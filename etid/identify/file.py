@@ -17,6 +17,8 @@ import dataclasses
 import functools
 import hashlib
 import json
+import logging
+import logging.handlers
 import multiprocessing
 import os
 import pathlib
@@ -33,6 +35,7 @@ from etid.estimators.registry import Method
 from etid.identify.options import Circuit, Interval, Options, candidates_of
 from etid.identify.study import Drivers, common_first, identify_part
 from etid.precision import in_float64
+from etid.recordings.causes import LOG
 from etid.recordings.hdf5 import read, read_with_driver
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import claimed, replace_text
@@ -84,15 +87,25 @@ def _fit_elsewhere(
     return _fit(_kept_open(sources, stamps, options), options, size, number)
 
 
-def _pin(cores: Any) -> None:
+def _pin(cores: Any, told: Any, level: int) -> None:
     """Bind this process to one core: shared cores cost XLA more than they gain.
 
     Ctrl-C reaches this process and its parent. The parent says what was kept, so this process ends
-    silently.
+    silently. What it logs is told by the parent, too.
     """
+    LOG.setLevel(level)
+    LOG.addHandler(logging.handlers.QueueHandler(told))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {cores.get()})
+
+
+class _Relayed(logging.Handler):
+    """Passes on what other processes log."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log it here."""
+        LOG.handle(record)
 
 
 @contextlib.contextmanager
@@ -100,13 +113,19 @@ def processes(workers: int) -> Iterator[concurrent.futures.Executor]:
     """An executor of `workers` processes of this machine, each bound to one core."""
     context = multiprocessing.get_context("spawn")
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
-    cores = context.Queue()
+    cores, told = context.Queue(), context.Queue()
     for worker in range(workers):
         cores.put(available[worker % len(available)])
-    with concurrent.futures.ProcessPoolExecutor(
-        workers, mp_context=context, initializer=_pin, initargs=(cores,)
-    ) as executor:
-        yield executor
+    listener = logging.handlers.QueueListener(told, _Relayed())
+    listener.start()
+    try:
+        arguments = cores, told, LOG.getEffectiveLevel()
+        with concurrent.futures.ProcessPoolExecutor(
+            workers, mp_context=context, initializer=_pin, initargs=arguments
+        ) as executor:
+            yield executor
+    finally:
+        listener.stop()
 
 
 class _Parts:
@@ -173,7 +192,7 @@ def fit_file(
     Args:
         source: File of recordings. Every process of `executor` must find it under this name.
         target: File of fits to write. Until it is complete, its parts are in `target.parts`.
-        driver: File of the driver of all recordings, as `CheckedCalibration.write` writes it, in
+        driver: File of the driver of all recordings, as `Driver.write` writes it, in
             place of the calibrations of the source.
         order: As in `identify_driver`; default 5, with `driver` `"auto"` as in `read_driver`.
         circuit: As in `identify_skins`. With `"auto"` a sample of the recordings chooses it.

@@ -278,11 +278,18 @@ def refitted(
         return {row: lane for row, lane in less.items() if lane is not None}
 
     found = fit(lanes)
-    for reason, choose in ((aligned, lambda _, second: second), (without_mains, better)):
-        if changed := reason(found):
+    for change, choose, why in (
+        (aligned, lambda _, second: second, "with v_out aligned to the first fit"),
+        (without_mains, better, "without the mains harmonics"),
+    ):
+        if changed := change(found):
             again = fit(list(changed.values()))
             for number, row in enumerate(changed):
-                found[row] = choose(found[row], again[number])
+                second = again[number]
+                found[row] = kept = choose(found[row], second)
+                which = "second" if kept is second else "first"
+                path = seen[row].recording.path or "recording"
+                LOG.info("%s: fitted again %s; the %s fit is kept.", path, why, which)
     return found
 
 

@@ -1,7 +1,6 @@
 """Where the electrodes of a display are."""
 
 import dataclasses
-import json
 import os
 import pathlib
 from collections.abc import Sequence
@@ -9,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from etid.recordings.errors import RecordingError, located, require_file
+from etid.recordings.errors import RecordingError, located, optional, require_file
 from etid.recordings.tables import rows_of
 
 COLUMNS, PITCH = 7, 2e-3  # electrodes in a row of the paper's display, and their distance [m]
@@ -79,7 +78,7 @@ class Layout:
 FINGERTIP = Layout.grid(14, COLUMNS, PITCH)
 """The paper's display: 98 electrodes, 2 mm apart, on 26 x 12 mm²."""
 
-_MICROMETRE = 1e-6
+_UNITS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
 
 
 def read_layout(path: str | os.PathLike[str]) -> Layout:
@@ -87,30 +86,29 @@ def read_layout(path: str | os.PathLike[str]) -> Layout:
 
     Args:
         path: A CSV table with the columns `electrode`, `x` and `y` [m], or a file of
-            probeinterface (`.json`) with one probe; its contacts are electrodes by their
-            `contact_ids`.
+            probeinterface (`.json`; extra `probe`) with one planar probe; its contacts are
+            electrodes by their `contact_ids`.
 
     Raises:
-        RecordingError: The file is missing, or is neither of both.
+        RecordingError: The file is missing, is neither of both, or needs a package.
     """
     require_file(os.fspath(path))
     file = pathlib.Path(path)
+    if file.suffix.lower() == ".json":
+        return _of_probe(file)
     with located(str(file), foreign=(ValueError, KeyError, UnicodeDecodeError)):
-        if file.suffix.lower() == ".json":
-            return _of_probe(json.loads(file.read_text("utf-8")))
         rows = rows_of(file, ("electrode", "x", "y"))
         x, y = ([float(row[name]) for row in rows] for name in ("x", "y"))
         return Layout([row["electrode"] for row in rows], np.array(x), np.array(y))
 
 
-def _of_probe(content: object) -> Layout:
-    """The layout of the one probe of a probeinterface file (specification 0.2)."""
-    probes = content.get("probes") if isinstance(content, dict) else None
-    if not isinstance(probes, list) or len(probes) != 1:
-        raise RecordingError("must hold one probe of probeinterface")
-    [probe] = probes
-    places = np.asarray(probe["contact_positions"], float)
-    unit = {"um": _MICROMETRE, "mm": 1e-3, "m": 1.0}.get(probe.get("si_units", "um"))
-    if unit is None or places.ndim != 2 or places.shape[1] != 2:
-        raise RecordingError("must have two-dimensional contact_positions in um, mm or m")
-    return Layout(probe["contact_ids"], unit * places[:, 0], unit * places[:, 1])
+def _of_probe(file: pathlib.Path) -> Layout:
+    """The layout of the one probe of a file of probeinterface."""
+    reader = optional("probeinterface", "probe", str(file))
+    with located(str(file), foreign=Exception):
+        probes = reader.read_probeinterface(file).probes
+        if len(probes) != 1 or probes[0].ndim != 2:
+            raise RecordingError("must hold one planar probe")
+        [probe] = probes
+        places = _UNITS[probe.si_units] * probe.contact_positions
+        return Layout(probe.contact_ids.tolist(), *places.T)

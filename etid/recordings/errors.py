@@ -2,8 +2,10 @@
 
 import contextlib
 import difflib
+import importlib
 import os
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 
 class RecordingError(ValueError):
@@ -113,3 +115,22 @@ def _simple(name: str) -> str:
 def install(extra: str) -> str:
     """What installs an extra of etid, as the remedy of a package that is missing."""
     return f"pip install 'etid[{extra}]' (in a clone: '.[{extra}]')"
+
+
+def optional(module: str, extra: str, file: str, package: str = "") -> Any:
+    """A module of a package that only users of one format need.
+
+    Args:
+        module: Name of the module.
+        extra: Extra of etid that installs the package.
+        file: The file that needs it.
+        package: Name of the package if it is not that of the module.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise RecordingError(
+            f"needs the package {package or module}",
+            file=file,
+            remedy=f"Run {install(extra)}",
+        ) from error

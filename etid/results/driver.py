@@ -2,6 +2,8 @@
 
 import abc
 import dataclasses
+import os
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import equinox as eqx
@@ -14,7 +16,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.display import plus_minus, several
 from etid.circuits.overview import Overview
 from etid.numpy_tier.tiers import program
+from etid.recordings.recording import Recording
 from etid.recordings.remarks import texts
+from etid.recordings.study import Study
 from etid.results.feed import AbstractFeed, SourceImpedance
 from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS, message
@@ -108,9 +112,12 @@ class Driver(AbstractFeed):
         steps: Iterations of the solver.
         method: Name of the estimator.
         remarks: Remarks on the calibrations, `etid.recordings.remarks.Remark` as an integer.
+        recordings: Calibrations of a driver that `identify_driver` returned. They are no leaves,
+            since no computation needs them: a driver that JAX has mapped has none.
     """
 
     recorded: ClassVar[str] = "v_th"
+    recordings: ClassVar[Sequence[Recording]] = ()
     _: dataclasses.KW_ONLY
     b: Float[Array, " b"]
     a: Float[Array, " a"]
@@ -126,6 +133,20 @@ class Driver(AbstractFeed):
     def order(self) -> int:
         """Number of poles."""
         return self.a.shape[0] - 1
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the calibrations; `etid.read_driver` identifies the driver from them again.
+
+        Raises:
+            ValueError: `identify_driver` did not return this driver.
+            RecordingError: The file cannot be written.
+        """
+        if not self.recordings:
+            raise ValueError(
+                "this driver does not hold its calibrations; write the one that "
+                "etid.identify_driver or etid.calibrate returns"
+            )
+        Study.from_recordings(self.recordings).write(path)
 
     @program
     def gain(

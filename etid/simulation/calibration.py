@@ -21,7 +21,6 @@ from etid.precision import in_float64
 from etid.recordings.hdf5 import read_calibrations
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
-from etid.recordings.study import Study
 from etid.results.driver import AUTO, Driver, Order
 from etid.results.fit import Fit, IdentificationError
 from etid.simulation.published import TYPICAL
@@ -58,10 +57,6 @@ class CheckedCalibration(Overviewed):
     moved: float = float("nan")
     shifts: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
     r_load: float | None = None
-
-    def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the calibrations; `read_driver` identifies the driver from them again."""
-        Study.from_recordings(self.recordings).write(path)
 
     def _overview(self) -> Overview:
         records = [
@@ -143,7 +138,7 @@ def calibrate(
 
 
 def read_driver(path: str | os.PathLike[str], *, order: Order = AUTO) -> Driver:
-    """Identify the driver of the calibrations in a file, as `CheckedCalibration.write` writes it.
+    """Identify the driver of the calibrations in a file, as `Driver.write` writes it.
 
     Args:
         path: File of recordings; only its calibrations are used.

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, optional, rate_of
-from etid.recordings.recording import RecordingError
+from etid.files.channel import Channel, Contents, rate_of
+from etid.recordings.errors import RecordingError, optional
 
 
 @contextlib.contextmanager

@@ -12,9 +12,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, optional, spooled_channel, with_unit
+from etid.files.channel import Channel, Contents, spooled_channel, with_unit
 from etid.files.readers.delimited import ROWS
-from etid.recordings.recording import RecordingError
+from etid.recordings.errors import RecordingError, optional
 
 
 @contextlib.contextmanager

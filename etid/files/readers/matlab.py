@@ -17,9 +17,9 @@ import h5py
 import numpy as np
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
-from etid.files.channel import Channel, Contents, array_channel, optional, real
+from etid.files.channel import Channel, Contents, array_channel, real
 from etid.recordings import limits
-from etid.recordings.errors import RecordingError
+from etid.recordings.errors import RecordingError, optional
 from etid.recordings.untrusted import attribute, check_size, guarded, local_link
 
 

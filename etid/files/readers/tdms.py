@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, one_unit, optional, rate_of, real
-from etid.recordings.recording import RecordingError
+from etid.files.channel import Channel, Contents, one_unit, rate_of, real
+from etid.recordings.errors import RecordingError, optional
 
 
 @contextlib.contextmanager
