@@ -257,9 +257,10 @@ def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, 
     figure_of(recording)
     assert plt.get_fignums() == before
     monkeypatch.setattr(plt, "show", lambda: None)
-    axes = etid.plot(recording)
+    axes = etid.plot(recording, size=(3.3, 1.8))
     [new] = set(plt.get_fignums()) - set(before)
     assert plt.figure(new) is axes[0].figure
+    np.testing.assert_allclose(axes[0].figure.get_size_inches(), (3.3, 1.8))
     plt.close(new)
 
 

@@ -84,6 +84,8 @@ etid.Fits.read('missing.h5') -> no such file
 realise(Rational(jnp.array([0.0, 0.001]), jnp.ones(1)), RATE) -> grows without bound
 figure_of(of.driver, show='residual') -> it is for fits, and one of 'pulse', 'impedance'
 etid.plot(of.driver, axes=new_figure(2, 2, (6.0, 5.0))[1][:1, 0]) -> 1 Axes; this picture takes 2
+etid.plot(of.driver, axes=new_figure(2, 1, (6.0, 5.0))[1], size=(3.3, 3.6))
+    -> size is that of a new figure
 figure_of(pictures.fits(), by='session') -> by is 'session', must be two labels
 figure_of(pictures.fits(), by=('session', 'day')) -> day: is no label
 save(figure_of(of.driver), 'figure.pdf') -> \.png or \.svg

@@ -28,10 +28,13 @@ if TYPE_CHECKING:
     from etid.plotting.style import Canvas
 
 Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
+Size = tuple[float, float] | None
 
 
 @overload
-def plot(x: Recording, *, axes: AnyAxes = None, title: str | None = "") -> np.ndarray: ...
+def plot(
+    x: Recording, *, axes: AnyAxes = None, size: Size = None, title: str | None = ""
+) -> np.ndarray: ...
 @overload
 def plot(
     x: Fit,
@@ -39,6 +42,7 @@ def plot(
     driver: Driver | None = None,
     *,
     axes: AnyAxes = None,
+    size: Size = None,
     title: str | None = "",
     show: Shown = "pulse",
 ) -> np.ndarray: ...
@@ -49,17 +53,24 @@ def plot(
     driver: Driver,
     *,
     axes: AnyAxes = None,
+    size: Size = None,
     title: str | None = "",
 ) -> np.ndarray: ...
 @overload
 def plot(
-    x: Driver, recording: Recording, *, axes: AnyAxes = None, title: str | None = ""
+    x: Driver,
+    recording: Recording,
+    *,
+    axes: AnyAxes = None,
+    size: Size = None,
+    title: str | None = "",
 ) -> np.ndarray: ...
 @overload
 def plot(
     x: Fits,
     *,
     axes: AnyAxes = None,
+    size: Size = None,
     title: str | None = "",
     by: Sequence[str] | None = None,
     map: str | None = None,
@@ -70,6 +81,7 @@ def plot(
     x: Impedance | Mapping[str, Impedance] | Posterior | Profile | Bound | Mapping[str, Bound],
     *,
     axes: AnyAxes = None,
+    size: Size = None,
     title: str | None = "",
 ) -> np.ndarray: ...
 @in_float64
@@ -79,6 +91,7 @@ def plot(
     driver: Driver | None = None,
     *,
     axes: AnyAxes = None,
+    size: Size = None,
     title: str | None = "",
     show: Shown = "pulse",
     by: Sequence[str] | None = None,
@@ -136,6 +149,7 @@ def plot(
         layout: Places of the electrodes; if not given, `E1` to `E98` of the paper's display.
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
+        size: Width and height of this figure [inch]; if not given, one for a screen.
         title: Replaces the titles of the picture; None leaves them out, as a paper does.
 
     Returns:
@@ -143,12 +157,15 @@ def plot(
 
     Raises:
         TypeError: etid cannot draw `x`, or `recording` or `driver` is missing.
-        ValueError: `x` is empty, or the picture needs another number of axes.
+        ValueError: `x` is empty, the picture needs another number of axes, or `size` is given
+            together with `axes`.
     """
     from etid.plotting import style
 
-    canvas = style.on_pyplot if axes is None else style.on_axes(axes)
-    drawn = _draw(canvas, x, recording, driver, show, by, map, layout)
+    if axes is not None and size is not None:
+        raise ValueError("size is that of a new figure; set the size of the figure of your axes")
+    canvas = style.on_pyplot(size) if axes is None else style.on_axes(axes)
+    drawn = _draw(canvas, x, recording, driver, show=show, by=by, map=map, layout=layout)
     if title != "":
         for axis in drawn.flat:
             axis.set_title("", loc="left")
@@ -157,13 +174,7 @@ def plot(
 
 
 def figure_of(
-    x: Any,
-    recording: Recording | None = None,
-    driver: Driver | None = None,
-    show: Shown = "pulse",
-    by: Sequence[str] | None = None,
-    map: str | None = None,
-    layout: "Layout | None" = None,
+    x: Any, recording: Recording | None = None, driver: Driver | None = None, **options: Any
 ) -> "matplotlib.figure.Figure":
     """The picture of `plot`, on a figure outside of `matplotlib.pyplot`; same arguments."""
     from etid.plotting import style
@@ -171,7 +182,7 @@ def figure_of(
     def canvas(*grid: Any, **options: Any) -> np.ndarray:
         return style.new_figure(*grid, **options)[1]
 
-    return _draw(canvas, x, recording, driver, show, by, map, layout)[0].figure
+    return _draw(canvas, x, recording, driver, **options)[0].figure
 
 
 @np.errstate(all="ignore")  # a fit that failed may hold any number
@@ -180,10 +191,11 @@ def _draw(
     x: Any,
     recording: Recording | None,
     driver: Driver | None,
-    show: Shown,
-    by: Sequence[str] | None,
-    element: str | None,
-    layout: "Layout | None",
+    *,
+    show: Shown = "pulse",
+    by: Sequence[str] | None = None,
+    map: str | None = None,
+    layout: "Layout | None" = None,
 ) -> np.ndarray:
     import matplotlib as mpl
 
@@ -191,11 +203,10 @@ def _draw(
     from etid.plotting.layout import FINGERTIP
 
     if show not in get_args(Shown) or (show != "pulse" and not isinstance(x, Fit)):
-        raise ValueError(
-            f"show is {show!r}; it is for fits, and one of {', '.join(map(repr, get_args(Shown)))}"
-        )
-    is_map = element is not None or layout is not None
-    if is_map and (element is None or not isinstance(x, Fits)):
+        allowed = ", ".join(repr(one) for one in get_args(Shown))
+        raise ValueError(f"show is {show!r}; it is for fits, and one of {allowed}")
+    is_map = map is not None or layout is not None
+    if is_map and (map is None or not isinstance(x, Fits)):
         raise TypeError("map is for Fits, and layout for a map: plot(fits, map='r_p')")
     if by is not None and (is_map or not isinstance(x, Fits)):
         raise TypeError("by is for Fits without a map: plot(fits, by=('session', 'subject'))")
@@ -231,8 +242,8 @@ def _draw(
                 )
             case Recording(), None, None:
                 return pulses.draw_recording(canvas, x)
-            case Fits(), None, None if element is not None:
-                return maps.draw_map(canvas, x, element, layout or FINGERTIP)
+            case Fits(), None, None if map is not None:
+                return maps.draw_map(canvas, x, map, layout or FINGERTIP)
             case Fits(), None, None:
                 return elements.draw_fits(canvas, x, by or ("subject", "condition"))
             case Posterior(), None, None:

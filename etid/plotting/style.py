@@ -65,12 +65,16 @@ def new_figure(
         return figure, _subplots(figure, rows, columns, options)
 
 
-def on_pyplot(rows: int, columns: int, size: tuple[float, float], **options: Any) -> np.ndarray:
-    """A canvas on a new figure that a notebook or `matplotlib.pyplot.show` shows."""
+def on_pyplot(own: tuple[float, float] | None) -> Canvas:
+    """A canvas on a new figure, of its own size, that a notebook or `pyplot.show` shows."""
     import matplotlib.pyplot as plt  # here, because it chooses a backend for the whole process
 
-    with mpl.rc_context(PAPER):
-        return _subplots(plt.figure(figsize=size, layout="constrained"), rows, columns, options)
+    def canvas(rows: int, columns: int, size: tuple[float, float], **options: Any) -> np.ndarray:
+        with mpl.rc_context(PAPER):
+            figure = plt.figure(figsize=own or size, layout="constrained")
+            return _subplots(figure, rows, columns, options)
+
+    return canvas
 
 
 def on_axes(axes: Sequence[Axes] | np.ndarray) -> Canvas:

@@ -92,6 +92,7 @@ class HasSource(Generic[Circuit]):
         *,
         show: Shown = "pulse",
         axes: AnyAxes = None,
+        size: tuple[float, float] | None = None,
         title: str | None = "",
     ) -> np.ndarray:
         """Draw the fit; the same as `etid.plot(fit)`.
@@ -103,6 +104,7 @@ class HasSource(Generic[Circuit]):
             show: `"pulse"`, `"impedance"` or `"residual"`. A fit of `identify_impedance` has only
                 the picture of its impedance.
             axes: As in `etid.plot`.
+            size: As in `etid.plot`.
             title: As in `etid.plot`; None leaves the titles out.
 
         Returns:
@@ -112,7 +114,7 @@ class HasSource(Generic[Circuit]):
             TypeError: The recording is not known.
         """
         drawn = _of_higher_layer("etid.plotting", "plot")
-        return drawn(self, recording, driver, show=show, axes=axes, title=title)
+        return drawn(self, recording, driver, show=show, axes=axes, size=size, title=title)
 
     def posterior(
         self,
