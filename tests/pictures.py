@@ -198,8 +198,8 @@ PICTURES: dict[str, Callable[[], tuple]] = {
     "fit": lambda: (fit(), dry(), driver()),
     "fit_without_success": lambda: (fit("misfit"), dry(), driver()),
     "measured_impedance": lambda: (measured(),),
-    "fit_impedance": lambda: (fit(), dry(), driver(), "impedance"),
-    "fit_residual": lambda: (fit(), dry(), driver(), "residual"),
+    "fit_impedance": lambda: (fit(), dry(), driver()),
+    "fit_residual": lambda: (fit(), dry(), driver()),
     "selection": lambda: (selection(SkinRC="misfit"), spread(), driver()),
     "calibration": lambda: (driver(), study()["calibration/98k8"]),
     "driver": lambda: (driver(),),
@@ -217,7 +217,8 @@ def draw(name: str, path: pathlib.Path) -> None:
 
     with mpl.rc_context():
         mpl.rcdefaults()
-        figure_of(*PICTURES[name]()).savefig(path, dpi=DPI, metadata={"Software": None})
+        show = {"fit_impedance": "impedance", "fit_residual": "residual"}.get(name, "pulse")
+        figure_of(*PICTURES[name](), show=show).savefig(path, dpi=DPI, metadata={"Software": None})
 
 
 if __name__ == "__main__":
