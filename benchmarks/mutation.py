@@ -33,7 +33,8 @@ from benchmarks.runner import Target, at_most, each, option, report, tabled
 
 TARGETS = {"mutants that survive": at_most(0.1)}
 COPIED = (
-    *("etid", "tests", "benchmarks", "data_schema", "docs", "notebooks", "examples", ".ci"),
+    *("etid", "tests", "benchmarks", "data_schema", "docs", "notebooks", "examples"),
+    *("conda", ".ci"),
     ".pytest_cache",  # what was compiled for tests without a mutant
 )
 LIMIT = 600.0  # [s] of a mutant; one that takes longer counts as a survivor

@@ -172,6 +172,13 @@ def test_profiles_keep_to_the_bounds(free, beyond):
     np.testing.assert_allclose(ends, [middle, middle + 1.96 * error], rtol=0, atol=0.4 * error)
 
 
+def test_a_profile_ends_at_an_upper_bound(noisy, free):
+    bound = above(free, -1.0)
+    ended = etid.identify_skin(noisy, bounds={"r_s": (None, bound)}).profile("r_s")
+    np.testing.assert_allclose(ended.values[-1], bound, rtol=1e-9)
+    assert ended.interval()[1] == bound
+
+
 def test_a_choice_compares_each_circuit_inside_its_own_bounds(noisy, free):
     """R_p of the true circuit is forbidden; another circuit has no such element."""
     candidates = [etid.SkinRC(), etid.Resistor()]

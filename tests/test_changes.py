@@ -71,6 +71,17 @@ def test_the_element_that_moves_is_named(load, name):
     assert (np.abs(change.size - expected) < 4 * change.stderr + 0.005).all()
 
 
+def test_the_standard_errors_of_changes_are_what_the_changes_scatter_by():
+    off = []
+    for load, skin in LOADS.items():
+        scene, moves = rung(load), falling(skin, "r_p", 0.03)
+        for seed in range(10):
+            change = change_of(recorded(scene, moves, seed), scene, skin)
+            off.append((change.size - [0, -0.03, 0, 0]) / change.stderr)
+    # Of 80 numbers, of which some 60 are independent: four standard errors of a standard deviation.
+    assert 0.64 < np.sqrt(np.mean(np.square(off))) < 1.36
+
+
 def test_a_threshold_is_exceeded_as_rarely_as_it_says():
     for freedom, count in ((1, 3), (4, 16)):
         rare = scipy.stats.chi2.sf(changes.threshold(freedom, count), freedom)

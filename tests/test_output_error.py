@@ -122,13 +122,14 @@ def fitted():
     driver = etid.identify_driver(study["c"])
     kept_numbers.check("driver_in_time", kept_numbers.of_driver(driver))
 
-    def of(scale):
+    def of(scale, late=driver.calibration.delay_std_samples):
         lane = PaddedSamples.of(Inspected(study["a"]))
         told = jax.tree.map(jnp.asarray, lane)
         lane = dataclasses.replace(
             told, sigma_th=scale * told.sigma_th, sigma_out=scale * told.sigma_out
         )
-        return skin(lane, driver, None, etid.SkinRC(), OUTPUT_ERROR)
+        told = eqx.tree_at(lambda of: of.calibration.delay_std_samples, driver, jnp.asarray(late))
+        return skin(lane, told, None, etid.SkinRC(), OUTPUT_ERROR)
 
     return of
 
@@ -152,6 +153,19 @@ def test_if_the_noise_is_smaller_the_errors_are_what_it_is_said_to_be(fitted):
     own = [np.asarray(fit.cov - fit.shared_cov) for fit in (once, twice)]
     np.testing.assert_allclose(np.diagonal(own[1]), 4 * np.diagonal(own[0]), rtol=0.1)
     np.testing.assert_allclose(twice.chi2 / once.chi2, 1 / 4, rtol=1e-2)
+
+
+def test_the_delay_of_the_calibration_is_known_as_well_as_its_standard_deviation_says(fitted):
+    """One parameter with information c and prior 1/s²: cov = A + b bᵀ / (1/s² + c)."""
+    known, *others = (
+        np.diagonal(np.asarray((fit := fitted(1.5, late)).cov - fit.shared_cov))
+        for late in (1e-6, 0.01, 0.02, 1e3)
+    )
+    first, second, free = (cov - known for cov in others)
+    # Where a delay of the calibration matters most; the fits differ, too, by less than a tenth.
+    element = np.argmax(free / known)
+    ratio = (free[element] / first[element] - 1) / (free[element] / second[element] - 1)
+    assert ratio == pytest.approx(4, rel=0.1)
 
 
 def test_errors_of_a_driver_that_misses_its_calibration_are_as_large_as_it_does():
