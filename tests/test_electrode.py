@@ -526,7 +526,6 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(
     zero, two = jnp.zeros(()), jnp.zeros(2)
     monkeypatch.setattr(tick, "nearest_delay", lambda *_: (zero, zero))
     monkeypatch.setattr(tick, "searched", lambda *_: jnp.zeros(3))
-    monkeypatch.setattr(tick, "Pulse", lambda *_: types.SimpleNamespace(equations_at=None))
     for name in ("departure", "undelayed", "expected"):
         monkeypatch.setattr(GainModel, name, lambda *_: jnp.zeros(3, complex))
     fit = ATTEMPT(

@@ -244,8 +244,7 @@ def searched(
     """
 
     def far(at: Equations) -> Bool[Array, ""]:
-        step = inverse_of_few(at.matrix + DAMPING**2 * jnp.diag(jnp.diagonal(at.matrix)))
-        return ~(jnp.dot(at.gradient, step @ at.gradient) < SETTLED**2)
+        return ~(jnp.dot(at.gradient, inverse_of_few(at.matrix) @ at.gradient) < SETTLED**2)
 
     def going(carry: _Search) -> Bool[Array, ""]:
         return carry.unsettled & (carry.steps < SEARCH)
@@ -334,9 +333,3 @@ class Pulse(eqx.Module):
             curvature,
             curvature + prior,
         )
-
-    def equations_at(self, q: Float[Array, " own"]) -> Equations:
-        """Normal equations with the derivatives at `q`."""
-        own = LoadUnknowns.of(q)
-        expected = self.model.expected(own.log_elements)
-        return self.equations(own, self.jacobian(expected), expected.gain)

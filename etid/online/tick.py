@@ -20,6 +20,7 @@ from etid.online.projection import Seen
 from etid.online.pulse_fit import (
     DELAYS,
     SETTLED,
+    Equations,
     Expected,
     GainModel,
     Pulse,
@@ -292,9 +293,17 @@ def anew(
     number = jnp.argmin(jnp.where(jnp.isfinite(distances), distances, jnp.inf))
     start, delay = logs[number], delays[number]
     nothing = jnp.zeros((starts.shape[1], starts.shape[1]))
-    gain = measured.gain - model.departure(model.expected(start), delay)
-    pulse = Pulse(model, gain, measured.weight, start, nothing)
-    own = LoadUnknowns.of(searched(pulse.equations_at, LoadUnknowns(start, delay).vector(), wanted))
+
+    # With the departure of each step: that of a distant start moves the minimum by several standard
+    # errors, out of reach of the two steps that follow.
+    def equations(q: Float[Array, " own"]) -> Equations:
+        own = LoadUnknowns.of(q)
+        expected = model.expected(own.log_elements)
+        gain = measured.gain - model.departure(expected, own.delay_samples)
+        pulse = Pulse(model, gain, measured.weight, start, nothing)
+        return pulse.equations(own, pulse.jacobian(expected), expected.gain)
+
+    own = LoadUnknowns.of(searched(equations, LoadUnknowns(start, delay).vector(), wanted))
     expected = model.expected(own.log_elements)
     found = attempt(model, measured, own, expected, own.log_elements, nothing)
     unknown = ~jnp.all(jnp.diagonal(found.spread) < 1)
