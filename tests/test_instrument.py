@@ -9,9 +9,11 @@ import pytest
 import scipy.stats
 
 import etid
+from etid import cli
 from etid.circuits.circuit import AbstractCircuit, Farad, Ohm, SkinRC, parameter
 from etid.circuits.elements import capacitor, resistor
 from etid.circuits.impedance import parallel, series
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import given
 from etid.results.driver import ContinuousDriver, HarmonicDriver
@@ -25,6 +27,7 @@ DAMP = SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
 GAIN = etid.Instrument(gain=1e-3)
 ALL = etid.Instrument(gain=2e-3, r_load=2e-3, crosstalk=2e-3, capacitance=2e-12)
 DRAWS = 40
+NORMAL_95 = scipy.stats.norm.ppf(0.975)
 
 
 class BesideCable(AbstractCircuit):
@@ -53,6 +56,27 @@ def records(skin=DRY, *, gain=0.0, r_load=0.0, crosstalk=0.0, capacitance=0.0, s
         for one in (of["calibration"], of["skin"])
     )
     return calibration.replace(r_load=R_LOAD / (1 + r_load)), skin
+
+
+def trials(loads, *, seed=0, gain=0.0, r_load=0.0, crosstalk=0.0, capacitance=0.0, **options):
+    """A calibration and recordings of these loads by path, all with the same errors."""
+    disturbed = []
+    for path, of in loads.items():
+        beside = BesideCable(of.r_s, of.r_p, of.c_p, capacitance) if capacitance else of
+        disturbed.append(Trial(path, beside))
+    known = Trial("calibration", ResistorLoad(R_LOAD))
+    scene = Scene(tuple(disturbed), (known,), samples=10_000, snr_db=60.0, **options)
+    found = []
+    for one in scene.simulate(seed).recordings():
+        wrong = one.replace(v_out=(1 + gain) * one.v_out + crosstalk * one.v_th)
+        found.append(wrong if one.r_load is None else wrong.replace(r_load=R_LOAD / (1 + r_load)))
+    return etid.Study.from_recordings(found)
+
+
+def together(study, instrument=None):
+    """Joint fits of all trials by path."""
+    fits = etid.identify_jointly(study, instrument=instrument).fits
+    return {path: fits[i] for i, path in enumerate(fits.labels["path"])}
 
 
 def fitted(calibration, skin, instrument=None):
@@ -125,6 +149,67 @@ def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax():
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
 
 
+def test_the_derivatives_of_the_calibrations_by_the_errors_are_those_of_jax():
+    driver = etid.identify_driver(records()[0], instrument=ALL)
+    assert isinstance(driver, HarmonicDriver)
+    with jax.enable_x64(True):
+        of = Calibrations.of(driver)
+        common = of.start() + jnp.linspace(0.1, 1.0, of.start().size)
+        found = jnp.moveaxis(jax.jit(lambda c: of.slopes(c).by_unknown)(common), 0, -1)
+        wanted = jax.jit(jax.jacfwd(of.gains))(common)
+        found, wanted = np.asarray(found), np.asarray(wanted)
+        size = np.abs(wanted).max(axis=(0, 1)) + (wanted == 0).all(axis=(0, 1))
+        # Rounding, times the condition of a sum over the poles of Z_th.
+        np.testing.assert_allclose(found / size, wanted / size, atol=1e-9)
+
+
+@pytest.mark.parametrize("shared", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_joint_fit_has_the_errors_of_the_instrument(shared):
+    loads = {"dry/0": DRY, "dry/1": DRY, "damp/0": DAMP}
+    study = trials(loads, gain=1e-3, shared_v_th=shared)
+    without = together(study)
+    assert np.abs(errors(without["dry/0"], DRY)).max() > 5
+    found = etid.identify_jointly(study, instrument=ALL)
+    (driver,) = found.drivers.values()
+    for number, (path, skin) in enumerate(loads.items()):
+        fit = found.fits[number]
+        assert fit.verdict == "successful"
+        assert np.abs(errors(fit, skin)).max() < 4
+        budget = fit.budget(study[path], driver)
+        relative = np.sqrt(np.diagonal(np.asarray(fit.cov))) / np.asarray(fit.circuit.values())
+        np.testing.assert_allclose(budget.together, relative, rtol=1e-6)
+        assert {"recording", "driver", *TOLERANCES} == set(budget.parts)
+        np.testing.assert_allclose(budget.parts["r_load"], 2e-3, rtol=0.05)
+    narrow = together(study, etid.Instrument(gain=1e-4))
+    assert {fit.verdict for fit in narrow.values()} == {"inconsistent"}
+
+
+def test_a_joint_fit_finds_a_gain_that_moves_r_p_by_a_third():
+    loads = {"dry": DRY, "damp": DAMP}
+    study = trials(loads, gain=-2e-2, trigger_jitter_rms=50e-9)
+    for path, fit in together(study, etid.Instrument(gain=2e-2)).items():
+        assert fit.verdict == "successful"
+        assert np.abs(errors(fit, loads[path])).max() < 4
+
+
+# 1 pF moves the driver of a joint fit along its curved valley: its effect is not linear.
+@pytest.mark.parametrize("source", sorted({*TOLERANCES} - {"capacitance"}))
+def test_a_budget_of_a_joint_fit_says_what_an_error_that_nobody_stated_does(source):
+    size, loads = TOLERANCES[source][1], {"0": DRY, "1": DRY}
+    error: dict[str, Any] = {source: size}
+    # Without jitter each study would limit its delays by another width.
+    right, wrong = (trials(loads, trigger_jitter_rms=50e-9, **of) for of in ({}, error))
+    found = etid.identify_jointly(right, instrument=etid.Instrument())
+    fits = found.fits[0], together(wrong)["0"]
+    before, after = (np.log(np.asarray(fit.circuit.values())) for fit in fits)
+    (driver,) = found.drivers.values()
+    told = found.fits[0].budget(right["0"], driver).unstated[source]
+    # As for single fits.
+    np.testing.assert_allclose(np.abs(after - before), told, rtol=0.1, atol=0.05 * told.max())
+    with pytest.raises(ValueError, match=r"pass instrument=etid.Instrument\(\)"):
+        together(wrong)["0"].budget(wrong["0"], driver)
+
+
 def test_tolerances_are_kept_in_files_of_fits(tmp_path):
     calibration, skin = records()
     study = etid.Study.from_recordings([calibration, skin])
@@ -138,6 +223,12 @@ def test_tolerances_are_kept_in_files_of_fits(tmp_path):
     assert isinstance(driver, ContinuousDriver)
     assert driver.instrument is not None
     assert driver.instrument.stored() == ALL.stored()
+    study.write(tmp_path / "study.h5")
+    command = ["fit", str(tmp_path / "study.h5"), "-o", str(tmp_path / "joint.h5"), "--joint"]
+    assert cli.main([*command, "--tolerance", "crosstalk=0.002"]) == 0
+    settings = etid.StudyFits.read(tmp_path / "joint.h5").settings
+    assert settings is not None
+    assert settings.instrument == ("crosstalk 0.002",)
 
 
 REFUSED = {
@@ -175,8 +266,28 @@ def test_intervals_hold_errors_that_are_drawn_from_their_tolerances(skin):
         drawn["capacitance"] = abs(drawn["capacitance"])
         fit = fitted(*records(skin, seed=number, **drawn), ALL)
         refused += fit.verdict != "successful"
-        inside += int(np.sum(np.abs(errors(fit, skin)) < scipy.stats.norm.ppf(0.975)))
+        inside += int(np.sum(np.abs(errors(fit, skin)) < NORMAL_95))
     assert refused <= 1  # of 40: one of a thousand is refused by chance
     # Three elements of a fit are not independent, so that the count is one of 40 in the worst case.
     low, high = scipy.stats.binom.interval(0.999, DRAWS, 0.95)
     assert low <= inside / 3 <= high
+
+
+@pytest.mark.slow
+def test_intervals_of_joint_fits_hold_errors_that_are_drawn_from_their_tolerances():
+    loads = {f"{kind}/{i}": skin for kind, skin in (("dry", DRY), ("damp", DAMP)) for i in range(5)}
+    inside, refused = {"dry": 0, "damp": 0}, 0
+    for number in range(DRAWS):
+        draw = np.random.default_rng([number, 5])
+        drawn = {name: size * draw.standard_normal() for name, size in ALL.stored().items()}
+        drawn["capacitance"] = abs(drawn["capacitance"])
+        study = trials(loads, seed=number, trigger_jitter_rms=50e-9, **drawn)
+        for path, fit in together(study, ALL).items():
+            refused += fit.verdict != "successful"
+            kind, _, _ = path.partition("/")
+            inside[kind] += int(np.sum(np.abs(errors(fit, loads[path])) < NORMAL_95))
+    assert refused <= 3  # of 400: one of a thousand is refused by chance
+    # The fits of a study share most of their errors: the count is one of 40 in the worst case.
+    low, high = scipy.stats.binom.interval(0.999, DRAWS, 0.95)
+    assert low <= inside["dry"] / 15 <= high
+    assert low <= inside["damp"] / 15 <= high

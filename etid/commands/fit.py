@@ -205,10 +205,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ValueError(f"--joint uses maximum_likelihood; remove --method {arguments.method}")
     if arguments.joint and arguments.driver_drift:
         raise ValueError("--joint identifies the driver itself; remove --driver-drift")
-    if arguments.joint and arguments.tolerance:
-        raise ValueError(
-            "--joint has no tolerances but --r-load-tolerance; remove --tolerance, or --joint"
-        )
     if arguments.r_load_tolerance and not arguments.joint:
         raise ValueError(
             "--r-load-tolerance enters the standard errors of joint fits; add --joint, or remove it"
@@ -221,6 +217,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         "prior": _several("--prior", arguments.prior, 2),
         "bounds": _several("--bound", arguments.bound, 2),
         "plausible": arguments.plausible,
+        "instrument": _instrument(arguments.tolerance),
     }
     progress = sys.stderr.isatty()
     if arguments.joint:
@@ -249,7 +246,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 order=arguments.order,
                 method=arguments.method,
                 driver_drift=arguments.driver_drift,
-                instrument=_instrument(arguments.tolerance),
                 resume=arguments.resume,
                 executor=executor,
                 progress=progress,

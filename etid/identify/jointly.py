@@ -62,6 +62,7 @@ from etid.recordings.study import Study
 from etid.results.driver import HarmonicDriver, Order
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
+from etid.results.instrument import TOLERANCES, Instrument, by_tolerance
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.results.verdicts import RESULTS, verdict, verdict_names, verdicts_of
 from etid.selection.delays import upper_limit
@@ -103,7 +104,7 @@ class _Start(NamedTuple):
 def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
     frequency = jnp.asarray(lanes.frequency)[0]
     known = shape_of(driver, frequency)
-    if isinstance(lanes, HarmonicsWithCurrent):
+    if isinstance(lanes, HarmonicsWithCurrent) or driver.instrument is not None:
         given = given_driver.given(driver, frequency, model.shared)
     else:
         given = model.around(model.calibrations.start(), frequency, slopes=False)
@@ -115,11 +116,12 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
         if isinstance(lane, HarmonicsWithCurrent):
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
         found = fit_alone(model, given, spectrum, sample_rate, starts, current)
-        own, result, chi2, error, hum = found
+        own, result, chi2, error, hum, errors = found
         settled = result == optx.RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judgement.misses(chi2, error)
         changed = jnp.array(False) if known is None else known.differs(spectrum)
-        loads = Loads(spectrum, sample_rate, own, good & ~changed, jnp.array(-1), current)
+        used = good & ~changed
+        loads = Loads(spectrum, sample_rate, own, errors, used, jnp.array(-1), current)
         return _Start(loads, hum, changed)
 
     return each(one, lanes, count)
@@ -146,6 +148,8 @@ def _together(
             estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
         )
         fit = judgement.judged(with_scale, model.circuit, driver.result, METHOD, model.bounds)
+        if driver.instrument is not None:
+            fit = dataclasses.replace(fit, by_tolerance=by_tolerance(found.by_error.T))
         fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)
         return judgement.unless(fit, found.other, RESULTS.misfit)
 
@@ -303,6 +307,7 @@ def identify_jointly(
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
+    instrument: Instrument | None = None,
     r_load_tolerance: float = 0.0,
     plausible: tuple[float, float] = PLAUSIBLE,
     progress: bool = False,
@@ -325,6 +330,9 @@ def identify_jointly(
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
+        instrument: Tolerances of the instrument, as in `identify_driver`; errors of one driver are
+            common to its calibrations and all its recordings. With `etid.Instrument()`, which has
+            none, `fit.budget` shows what they would add.
         r_load_tolerance: Relative standard deviation of the known resistors. No record shows this
             error. It passes 1:1 into every resistance and inversely into every capacitance.
         plausible: As in `identify_driver`.
@@ -333,7 +341,8 @@ def identify_jointly(
     Returns:
         One fit for each recording, and the drivers that all records together determine. In the
         fits, `shared_cov` is the error that all recordings with one driver share: the error of
-        Z_th and `r_load_tolerance`. The rest of `cov` is the own error of each recording.
+        Z_th, the tolerances of the instrument and `r_load_tolerance`. The rest of `cov` is the own
+        error of each recording.
 
     Raises:
         ValueError: The study has no loaded recording.
@@ -346,6 +355,7 @@ def identify_jointly(
         prior=prior,
         bounds=bounds,
         order=order,
+        instrument=instrument,
         r_load_tolerance=r_load_tolerance,
         plausible=plausible,
     )
@@ -384,6 +394,11 @@ def identify_jointly(
             of_group = zip(group.rows, unstacked(judged), notes_of(judged), strict=True)
             for row, one, text in of_group:
                 fits[row], notes[row] = one, text
+    if instrument is not None:  # a fit that no driver is needed for, or that failed, has no part
+        none = np.full((len(TOLERANCES), len(only.circuit.names())), np.nan)
+        for row, fit in fits.items():
+            if fit.by_tolerance is None:
+                fits[row] = dataclasses.replace(fit, by_tolerance=none)
     ordered = stacked([fits[row] for row in range(len(paths))])
     outcome = table([fields_of(study, path) for path in paths], ordered, notes)
     settings = options.settings(study, len(paths), METHOD)
@@ -402,7 +417,9 @@ def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit]
     small = [np.zeros(len(group.rows), bool) for group in groups]
     width = _narrower(loads, found, delays, cov, float(driver.sample_rate))
     if width is not None and better.verdict == "successful":
-        again = dataclasses.replace(Calibrations.of(better), delay_width=jax.device_put(width))
+        # A start with errors of the instrument is made from the calibrations alone.
+        start = better if driver.instrument is None else driver
+        again = dataclasses.replace(_calibrations(start), delay_width=jax.device_put(width))
         model = dataclasses.replace(model, calibrations=again)
         others, better, *_ = together(model, loads, several, better, tolerance)
         others = jax.device_get(others)
@@ -435,4 +452,10 @@ def _alone_judged(fits: Fit, changed: Sequence[bool]) -> Fit:
 def _model(options: Options, driver: HarmonicDriver, shared: bool) -> Joint:
     circuit, known = options.circuit, options.known
     prior = ElementPrior.of(known, circuit) if known else None
-    return Joint(circuit, Calibrations.of(driver), shared, prior, options.bounds)
+    return Joint(circuit, _calibrations(driver), shared, prior, options.bounds)
+
+
+def _calibrations(driver: HarmonicDriver) -> Calibrations:
+    """The calibrations, with all errors of the instrument that a budget shows."""
+    told = driver.instrument
+    return dataclasses.replace(Calibrations.of(driver), instrument=told and told.narrow())

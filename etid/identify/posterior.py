@@ -49,13 +49,12 @@ from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
-from etid.results.instrument import TOLERANCES, Budget, Instrument
+from etid.results.instrument import NARROW, TOLERANCES, Budget, Instrument, by_tolerance
 from etid.results.posterior import Posterior
 from etid.solvers.importance_sampling import drawn
 from etid.solvers.matrices import inverse
 
 AT_ONCE = 16  # draws in one vectorised evaluation
-NARROW = 1e-3  # of a tolerance that nobody stated: a prior that no recording changes
 
 
 class Known(eqx.Module):
@@ -287,17 +286,24 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
             "a budget needs the driver of the fit, with the harmonics of its calibrations; "
             "identify it by maximum likelihood, and pass it as in fit.budget(recording, driver)"
         )
-    stated = (driver.instrument or Instrument()).stored()
-    narrow = {name: stated[name] or NARROW * size for name, (_, size) in TOLERANCES.items()}
-    asked = dataclasses.replace(driver, instrument=Instrument(**narrow).as_arrays())
-    lane, known, _ = given(fit, recording, asked)
-    effects = np.asarray(_effects(lane, known, fit.circuit))
-    gain, crosstalk, capacitance, *r_load = effects[-3 - driver.calibration.r_load.size :]
-    of = {"gain": gain, "crosstalk": crosstalk, "capacitance": capacitance}
-    of |= {"r_load": np.sqrt(np.sum(np.square(r_load), axis=0))}  # independent resistors
+    told = driver.instrument or Instrument()
+    stated = told.stored()
+    if fit.by_tolerance is None and fit.method == "joint":
+        raise ValueError(
+            "this joint fit has no budget: pass instrument=etid.Instrument() to identify_jointly, "
+            "with the tolerances that you know; files of fits keep none"
+        )
+    if fit.by_tolerance is None:
+        narrow = told.narrow()
+        lane, known, _ = given(fit, recording, dataclasses.replace(driver, instrument=narrow))
+        by_z = _effects(lane, known, fit.circuit)
+        errors = narrow.deviations(driver.calibration.r_load.size).size
+        of = by_tolerance(by_z[-errors:])
+    else:
+        of = fit.by_tolerance
+    of = dict(zip(TOLERANCES, np.asarray(of), strict=True))
     values = np.asarray(fit.circuit.values())
     cov, shared = (np.diagonal(np.asarray(of)) / values**2 for of in (fit.cov, fit.shared_cov))
-    of = {name: np.abs(effect) for name, effect in of.items()}
     instrument = {name: of[name] for name, size in stated.items() if size}
     rest = shared - sum(part**2 for part in instrument.values())
     return Budget(

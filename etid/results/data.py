@@ -179,7 +179,8 @@ class HasSource(Generic[Circuit]):
             The budget; `print` shows a table.
 
         Raises:
-            ValueError: As in `posterior`, or the driver has no harmonics of its calibrations.
+            ValueError: As in `posterior`, or the driver has no harmonics of its calibrations, or
+                a joint fit was not given an instrument.
         """
         return _of_higher_layer("etid.identify.posterior", "budget")(self, recording, driver)
 

@@ -185,6 +185,8 @@ class Fit(Judged, HasSource[Circuit]):
         support: How well the data support this circuit, for the choice between circuits; NaN or
             None if the method computes no likelihood.
         limits: Bounds of the elements; None without bounds.
+        by_tolerance: What each of `TOLERANCES` adds to the standard errors of a joint fit, as
+            `Instrument.narrow` has it [relative]; None in other fits and in files.
     """
 
     circuit: Circuit
@@ -200,6 +202,7 @@ class Fit(Judged, HasSource[Circuit]):
     change_stderr: Float[Array | np.ndarray, "*lane moved"] | None = None
     support: Support | None = None
     limits: Limited | None = None
+    by_tolerance: Float[Array | np.ndarray, "*lane tolerance parameter"] | None = None
 
     @property
     def stderr(self) -> Circuit:

@@ -22,6 +22,7 @@ TOLERANCES = {
     "crosstalk": (1.0, 1e-3),
     "capacitance": (1e-7, 1e-12),
 }
+NARROW = 1e-3  # of a tolerance that nobody stated: a prior that no recording changes
 
 
 class Instrument(eqx.Module):
@@ -54,9 +55,16 @@ class Instrument(eqx.Module):
                     f"at least 0 and below {largest:g}"
                 )
 
-    def of_loads(self) -> Float[Array, "3"]:
-        """Standard deviations of gain, crosstalk and capacitance, which change loads directly."""
-        return jnp.stack([jnp.asarray(of) for of in (self.gain, self.crosstalk, self.capacitance)])
+    def deviations(self, resistors: int) -> Float[Array, " error"]:
+        """Standard deviations of gain, crosstalk, capacitance, and of each known resistor."""
+        of_loads = self.gain, self.crosstalk, self.capacitance  # change loads directly
+        return jnp.stack([jnp.asarray(of) for of in (*of_loads, *[self.r_load] * resistors)])
+
+    def narrow(self: _Kind) -> _Kind:
+        """The same with a small deviation for each tolerance that nobody stated, for a budget."""
+        told = self.stored()
+        narrow = {name: told[name] or NARROW * size for name, (_, size) in TOLERANCES.items()}
+        return type(self)(**narrow).as_arrays()
 
     def stored(self) -> dict[str, float]:
         """The numbers by name."""
@@ -65,6 +73,13 @@ class Instrument(eqx.Module):
     def as_arrays(self: _Kind) -> _Kind:
         """The same with arrays, which a traced program takes as operands."""
         return type(self)(**{name: np.asarray(value) for name, value in self.stored().items()})
+
+
+def by_tolerance(effects: Float[Array, "error element"]) -> Float[Array, "tolerance element"]:
+    """Size of the effect of each of `TOLERANCES`; the errors are those of `deviations`."""
+    gain, crosstalk, capacitance = jnp.abs(effects[:3])
+    r_load = jnp.sqrt(jnp.sum(effects[3:] ** 2, axis=0))  # the resistors are independent
+    return jnp.stack([gain, r_load, crosstalk, capacitance])
 
 
 def _named(source: str, size: float) -> str:

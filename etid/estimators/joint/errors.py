@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.estimate import Estimate
 from etid.estimators.joint.terms import Joint, Loads, in_turn
+from etid.estimators.maximum_likelihood import load_fit
 from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import changes
@@ -109,10 +110,13 @@ class Found(NamedTuple):
     Attributes:
         estimate: The estimate.
         other: Whether the data show another circuit or another gain of V_out.
-        scale: Whether they show another scale of the current.
+        scale: Whether they show another scale of the current, or all loads contradict the
+            tolerances of the instrument.
         delay: Its trigger delay.
         by_scale: Derivatives of the logarithms of the elements with respect to that of a scale of
             all measured currents.
+        by_error: Changes of the logarithms of the elements with the prior mean of each error of the
+            instrument.
     """
 
     estimate: Estimate
@@ -120,6 +124,7 @@ class Found(NamedTuple):
     scale: Bool[Array, "*load"]
     delay: Delay
     by_scale: Float[Array, "*load element"]
+    by_error: Float[Array, "*load element error"]
 
 
 def estimates(
@@ -157,7 +162,8 @@ def estimates(
     score = total.score + sum((more for _, more in sums), start=jnp.zeros_like(total.score))
     cov = bread @ score @ bread
 
-    strain = model.calibrations.strain(common)
+    strain = of.strain(common)
+    beyond = load_fit.beyond(of.errors(common), of.errors(jnp.diagonal(bread)))
     judged = []
     for loads, (own, results), each, (sums_of, _) in zip(groups, fitted, found, sums, strict=True):
 
@@ -188,9 +194,10 @@ def estimates(
                 strain=strain,
             )
             delay = Delay(own.delay_samples, private[e, e], eliminated.slope[e])
-            wrong = _contradictions(at, load, own, eliminated, bread, total.score)
-            moved = eliminated.own_pull + eliminated.slope @ (bread @ pull)
-            return Found(estimate, *wrong, delay, moved[:e])
+            other, scale = _contradictions(at, load, own, eliminated, bread, total.score)
+            follows = eliminated.slope @ bread
+            moved = eliminated.own_pull + follows @ pull
+            return Found(estimate, other, scale | beyond, delay, moved[:e], of.errors(follows[:e]))
 
         judged.append(in_turn(one, loads, own, *each, results))
     return cov, judged

@@ -1,9 +1,10 @@
 """The loads of a driver near one point, with their own parameters eliminated.
 
 A driver acts on its records through a few functions of frequency, its *signals*: W = log(Z_th + R),
-and the gains of its calibrations if these estimate the unloaded record of a load. The terms r of a
-load are nearly linear in the signals and in its own parameters. With the own parameters at their
-minimum, the sum of squares of all loads is a quadratic function of the change δ of the signals,
+the errors of the instrument that change loads, which are constant, and the gains of its
+calibrations if these estimate the unloaded record of a load. The terms r of a load are nearly
+linear in the signals and in its own parameters. With the own parameters at their minimum, the sum
+of squares of all loads is a quadratic function of the change δ of the signals,
 
     ½ |r|² + gᵀ δ + ½ δᵀ H δ − ½ |T δ + t|²,      T = Lᵀ B Aᵀ,   t = Lᵀ B r,   L Lᵀ = (B Bᵀ)⁻¹,
 
@@ -28,7 +29,7 @@ from etid.estimators.estimate import MAX_STEPS, SOLVER
 from etid.estimators.joint.terms import Joint, Loads, in_turn
 from etid.estimators.maximum_likelihood.calibrations import DENSE, Calibrations
 from etid.estimators.maximum_likelihood.condensed import apart
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.given_driver import FAULTS, GivenDriver
 from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers import successive
@@ -95,11 +96,12 @@ class _Signals(eqx.Module):
             [model.shares(size) for size in sizes],
         )
 
-    def _of_each(self, known: Array, of_w: list[Array], axis: int) -> list[Array]:
-        """The signals of each part, from the gains of the calibrations and from W."""
+    def _of_each(self, known: Array, of_w: list[Array], faults: Array) -> list[Array]:
+        """The signals of each part: gains of the calibrations, W, and errors of the instrument."""
         found = [known]
         for w, of_x in zip(of_w, self.of_x, strict=True):
-            found.append(jnp.concatenate([w, known] if of_x else [w], axis))
+            constant = jnp.broadcast_to(faults[..., None], (*faults.shape, w.shape[-1]))
+            found.append(jnp.concatenate([w, constant, *([known] if of_x else [])], axis=-2))
         return found
 
     def _loaded(
@@ -112,7 +114,8 @@ class _Signals(eqx.Module):
         """The signals of each part."""
         known = self.calibrations.gains(common, self.calibrations.knots)
         of_w = [jnp.log(self._loaded(common, f))[None] for f in self.frequency]
-        return self._of_each(_parts(known), list(map(_parts, of_w)), 0)
+        faults = self.calibrations.errors(common)[:FAULTS]
+        return self._of_each(_parts(known), list(map(_parts, of_w)), faults)
 
     def slopes(self, common: Float[Array, " common"]) -> list[Float[Array, "common signal knot"]]:
         """Derivatives of the signals."""
@@ -122,7 +125,8 @@ class _Signals(eqx.Module):
         for f in self.frequency:
             rows = source.slopes(f) * reciprocal(self._loaded(common, f))[None, :]
             of_w.append(jnp.pad(rows, ((0, common.size - rows.shape[0]), (0, 0)))[:, None])
-        return self._of_each(_parts(known), list(map(_parts, of_w)), 1)
+        faults = self.calibrations.errors(jnp.eye(common.size))[:, :FAULTS]
+        return self._of_each(_parts(known), list(map(_parts, of_w)), faults)
 
 
 class _Near(eqx.Module):
@@ -202,16 +206,21 @@ def _of_calibrations(calibrations: Calibrations, common: Float[Array, " common"]
     return _Part(objective, pull, curvature, none, jnp.zeros(0))
 
 
-def _by_signals(driver: GivenDriver, shared: bool) -> GivenDriver:
+def _by_signals(
+    driver: GivenDriver, shared: bool, tolerances: Float[Array, " fault"]
+) -> GivenDriver:
     """A driver whose z are the signals at each harmonic."""
-    unit = jnp.array([1.0, 1.0j])[:, None]
+    unit, own = jnp.array([1.0, 1.0j])[:, None], W + tolerances.size
     slope, known = jnp.tile(unit, (1, driver.loaded.size)), None
+    slope = jnp.pad(slope, ((0, tolerances.size), (0, 0)))
     if shared and driver.gains is not None:
         count, size = driver.gains.shape
         slope = jnp.pad(slope, ((0, 2 * count), (0, 0)))
-        alone = jnp.pad(jnp.kron(jnp.eye(count, dtype=unit.dtype), unit), ((W, 0), (0, 0)))
+        alone = jnp.pad(jnp.kron(jnp.eye(count, dtype=unit.dtype), unit), ((own, 0), (0, 0)))
         known = jnp.tile(alone[:, :, None], (1, 1, size))
-    zero = jnp.zeros(slope.shape[0])
+    zero, faults = jnp.zeros(slope.shape[0]), driver.faults
+    if faults is not None:
+        faults = faults[0], jnp.pad(jnp.diag(tolerances), ((W, zero.size - own), (0, 0)))
     return dataclasses.replace(
         driver,
         slope=slope,
@@ -220,6 +229,7 @@ def _by_signals(driver: GivenDriver, shared: bool) -> GivenDriver:
         records=driver.records if shared else None,
         gains=driver.gains if shared else None,
         gain_slopes=known,
+        faults=faults,
     )
 
 
@@ -233,7 +243,8 @@ def _of_group(
     size = loads.spectrum.x.shape[-1]
     every = knots(size, DENSE)
     driver = model.around(common, loads.frequency[0], slopes=False)
-    driver = _by_signals(driver, model.shares(size))
+    tolerances = model.calibrations.tolerances[:FAULTS]
+    driver, smooth = _by_signals(driver, model.shares(size), tolerances), W + tolerances.size
 
     def one(load: Loads, own: Float[Array, " own"]) -> tuple[_Part, Float[Array, "own own"]]:
         lane, o = load.behind(driver, model), own.size
@@ -250,7 +261,7 @@ def _of_group(
         following = jnp.einsum("po,pck,sck->osk", root, by_own, by_signal)
         if lane.unloaded is not None:  # X is not smooth in frequency
             of_x = apart(lambda _: lane.by_x(near), q)
-            pull = jnp.concatenate([pull[:W], every.summed(of_x[W:])])
+            pull = jnp.concatenate([pull[:smooth], every.summed(of_x[smooth:])])
         found = _Part(
             objective=near.objective + 0.5 * jnp.dot(rest, rest),
             pull=pull,
@@ -268,9 +279,19 @@ def _of_group(
 
 
 def minimum(
-    model: Joint, groups: list[Loads]
+    model: Joint,
+    groups: list[Loads],
+    common: Float[Array, " common"],
+    owns: list[Array],
 ) -> tuple[Float[Array, " common"], list[Array], successive.Minimum]:
     """The minimum of a study; it has no derivative.
+
+    Args:
+        model: The likelihood.
+        groups: The loads.
+        common: Start of the common parameters.
+        owns: Starts of the unknowns of the loads of each group, next to their minima behind the
+            driver of `common`.
 
     Returns:
         The common parameters, the unknowns of the loads of each group, and what else is known.
@@ -287,8 +308,7 @@ def minimum(
         second_order=_second_order,
     )
 
-    owns = [loads.own.vector() for loads in groups]
-    start, named = ravel_pytree((model.calibrations.start(), owns))
+    start, named = ravel_pytree((common, owns))
 
     def approximate(y: Float[Array, " parameter"]) -> tuple[_Near, Float[Array, ""]]:
         common, owns = named(y)

@@ -79,6 +79,7 @@ class Loads(eqx.Module):
         spectrum: Harmonics of the recordings.
         sample_rate: Sampling rates of the recordings [Hz].
         own: Unknowns of each load, identified alone.
+        errors: Errors of the instrument that each load alone shows [their standard deviations].
         used: Whether the recording takes part. The others are fitted, but do not affect Z_th.
         unloaded: Index of the unloaded record among those that several loads share; −1 if no other
             load has it.
@@ -88,6 +89,7 @@ class Loads(eqx.Module):
     spectrum: Spectrum
     sample_rate: Float[Array, "*load"]
     own: LoadUnknowns
+    errors: Float[Array, "*load error"]
     used: Bool[Array, "*load"]
     unloaded: Int[Array, "*load"]
     current: Current | None = None

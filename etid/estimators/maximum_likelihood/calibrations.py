@@ -18,9 +18,11 @@ from etid.estimators.maximum_likelihood.profile import Profile, Records, excess,
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
+from etid.results.instrument import Instrument
 from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
+from etid.solvers.matrices import inverse_root
 
 DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 
@@ -28,7 +30,11 @@ DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 class Calibrations(eqx.Module):
     """The likelihood of the calibrations of a driver.
 
-    In all methods `common` is the vector of the `DriverUnknowns`.
+    In all methods `common` is the vector of the `DriverUnknowns`, followed by the errors of the
+    instrument in their standard deviations: gain, crosstalk, capacitance, and each known resistor.
+    A gain g, a crosstalk κ and an error θ of the resistor R change the gains to
+
+        V_out / V_th = (1 + g) R' / (R' + Z_th) + κ,      R' = R (1 + θ).
 
     Attributes:
         source: Z_th identified from the calibrations.
@@ -36,6 +42,7 @@ class Calibrations(eqx.Module):
         spectra: Harmonics of the calibrations.
         rate: Sampling rate of the calibrations [Hz].
         delay_width: Prior standard deviation of every trigger delay, of loads too [samples].
+        instrument: Tolerances of the instrument; None if it has none.
     """
 
     source: SourceImpedance
@@ -43,12 +50,24 @@ class Calibrations(eqx.Module):
     spectra: Spectrum
     rate: Float[Array, ""]
     delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jax.device_put(DELAY_WIDTH))
+    instrument: Instrument | None = None
 
     @classmethod
     def of(cls, driver: HarmonicDriver) -> "Calibrations":
         """The calibrations of an identified driver."""
         rate = jnp.asarray(driver.sample_rate)
-        return cls(driver.source, driver.calibration, driver.spectra, rate)
+        of = driver.source, driver.calibration, driver.spectra, rate
+        return cls(*of, instrument=driver.instrument)
+
+    @property
+    def tolerances(self) -> Float[Array, " error"]:
+        """Standard deviation of each error of the instrument."""
+        of, count = self.instrument, self.calibration.r_load.size
+        return jnp.zeros(0) if of is None else of.deviations(count)
+
+    def errors(self, common: Float[Array, "*row common"]) -> Float[Array, "*row error"]:
+        """The errors of the instrument among the common parameters."""
+        return common[..., common.shape[-1] - self.tolerances.size :]
 
     @property
     def knots(self) -> Knots:
@@ -84,11 +103,13 @@ class Calibrations(eqx.Module):
     def start(self) -> Float[Array, " common"]:
         """The common parameters identified from the calibrations alone."""
         vector, _ = ravel_pytree(self.source)
-        return DriverUnknowns(vector, self.calibration.delay_samples).vector()
+        known = DriverUnknowns(vector, self.calibration.delay_samples).vector()
+        return jnp.concatenate([known, jnp.zeros_like(self.tolerances)])
 
     def named(self, common: Float[Array, " common"]) -> DriverUnknowns:
         """The common parameters by name."""
-        return DriverUnknowns.of(common, self.calibration.r_load.size)
+        known = common[: common.size - self.tolerances.size]
+        return DriverUnknowns.of(known, self.calibration.r_load.size)
 
     def source_of(self, common: Float[Array, " common"]) -> SourceImpedance:
         """Z_th with these common parameters."""
@@ -102,23 +123,37 @@ class Calibrations(eqx.Module):
 
     def _gains(
         self, common: Float[Array, " common"], every: Knots | None
-    ) -> tuple[Complex[Array, "record frequency"], ...]:
-        """Z_th, the gains, and their derivatives with respect to Z_th."""
+    ) -> tuple[Complex[Array, "... frequency"], ...]:
+        """Z_th, the gains, and their derivatives with respect to Z_th and to the errors."""
         f = self.spectra.frequency if every is None else every.at(self.spectra.frequency)
         z_th = jax.vmap(self.source_of(common).response)(f)
-        resistance = as_complex(self.calibration.r_load)[:, None]
+        known = resistance = as_complex(self.calibration.r_load)[:, None]
+        off = as_complex(self.tolerances * self.errors(common))
+        if self.instrument is not None:
+            resistance = known * (1 + off[-known.size :, None])
         loop, late = reciprocal(resistance + z_th), self.named(common).delay_samples
         gains = jax.vmap(delayed, (0, 0, 0, None))(resistance * loop, f, late, self.rate)
-        return z_th, gains, -gains * loop
+        by_z = -gains * loop
+        if self.instrument is None:
+            return z_th, gains, by_z, gains[None][:0]
+        gain, crosstalk, *_ = off
+        inverse = reciprocal(resistance)
+        turned = gains * (resistance + z_th) * inverse
+        of_loads = jnp.stack([gains, turned, jnp.zeros_like(gains)])  # nothing is across a resistor
+        of_resistor = -(1 + gain) * by_z * z_th * known * inverse
+        of_each = as_complex(jnp.eye(known.size))[:, :, None] * of_resistor[None]
+        by_error = jnp.concatenate([of_loads, of_each])
+        by_error = by_error * as_complex(self.tolerances)[:, None, None]
+        return z_th, (1 + gain) * gains + crosstalk * turned, (1 + gain) * by_z, by_error
 
     def slopes(self, common: Float[Array, " common"], every: Knots | None = None) -> Slopes:
         """The gains and their derivatives, at all harmonics or at knots."""
         f = self.spectra.frequency if every is None else every.at(self.spectra.frequency)
-        z_th, gains, by_z = self._gains(common, every)
+        z_th, gains, by_z, by_error = self._gains(common, every)
         by_source = jnp.moveaxis(jax.vmap(self.source_of(common).slopes)(f), 0, 1)
         by_delay = -gains * frequency_variable(f / self.rate)
         alone = as_complex(jnp.eye(f.shape[0]))[:, :, None]
-        rows = [by_source * by_z[None], alone * by_delay[None]]
+        rows = [by_source * by_z[None], alone * by_delay[None], by_error]
         return Slopes(z_th, gains, by_z, jnp.concatenate(rows))
 
     @jax.jit  # JAX remembers its trace
@@ -137,6 +172,13 @@ class Calibrations(eqx.Module):
         found = means(near.profiles, self.knots, jnp.stack([share, noise]))
         return Linear(near.jacobian, *found, priors=self.weak(near.q)[1])
 
+    def following(self, linear: Linear) -> Float[Array, "known error"]:
+        """Changes of Z_th and of the delays at their minimum by the errors of the instrument."""
+        curvature = linear.curvature().expected
+        known = len(curvature) - self.tolerances.size
+        root = inverse_root(curvature[:known, :known])
+        return -root @ (root.T @ curvature[:known, known:])
+
     def gradient(self, near: Near, linear: Linear) -> Float[Array, " common"]:
         """Gradient of the condensed terms and of the weak priors."""
         return linear.jacobian @ near.condensed.part + self.rest(near.q)
@@ -153,8 +195,10 @@ class Calibrations(eqx.Module):
         """The terms of the weak priors and their derivatives."""
         of = self.named(common)
         late = jnp.eye(of.delay_samples.size) / self.delay_width
-        terms = [self._prior()(of.source), of.delay_samples / self.delay_width]
-        rows = jax.scipy.linalg.block_diag(self._prior().slopes(of.source), late)
+        errors = self.errors(common)
+        terms = [self._prior()(of.source), of.delay_samples / self.delay_width, errors]
+        rows = self._prior().slopes(of.source), late, jnp.eye(errors.size)
+        rows = jax.scipy.linalg.block_diag(*rows)
         return jnp.concatenate(terms), rows
 
     def _prior(self) -> Prior:

@@ -153,7 +153,10 @@ class Gains(eqx.Module):
 
     def faults(self, z: Float[Array, " z"]) -> Float[Array, "3"] | None:
         """Gain, crosstalk and capacitance; None if the instrument has no tolerances."""
-        return None if self.driver.faults is None else z @ self.driver.faults
+        if self.driver.faults is None:
+            return None
+        fault, by_z = self.driver.faults
+        return fault + z @ by_z
 
     def _undelayed(
         self,
@@ -209,5 +212,5 @@ class Gains(eqx.Module):
             by_fault = jax.jacfwd(lambda at: self._undelayed(z_load, w, at))(faults)
             each = jnp.moveaxis(by_fault, -1, 0)
             by_fault = jnp.stack([self.turned(q, of, self.frequency) for of in each])
-            rows[-1] = rows[-1] + jnp.tensordot(as_complex(self.driver.faults), by_fault, 1)
+            rows[-1] = rows[-1] + jnp.tensordot(as_complex(self.driver.faults[1]), by_fault, 1)
         return Slopes(z_load, value, by_load, jnp.concatenate(rows))

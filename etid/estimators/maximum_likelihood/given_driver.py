@@ -19,13 +19,9 @@ terms themselves, for many loads at once. Both estimates have the same errors ag
 they are not equal. They may differ by a standard error along the direction that one known resistor
 does not determine.
 
-**Errors of the instrument** are further z with a standard normal prior. A gain g, a crosstalk κ and
-a capacitance C change the outputs of a load (`etid.estimators.maximum_likelihood.gains`); g, κ and
-the known resistors θ also change the calibrations, whose minimum moves by
-
-    ∂c/∂θ = −H⁻¹ J W (∂terms/∂θ),
-
-with the H, J and W of `etid.estimators.sandwich`.
+**Errors of the instrument** θ are further z with a standard normal prior. A gain g, a crosstalk κ
+and a capacitance C change the outputs of a load (`etid.estimators.maximum_likelihood.gains`); all
+but C also change the calibrations, whose minimum moves by ∂c/∂θ = −H_cc⁻¹ H_cθ.
 """
 
 import dataclasses
@@ -38,17 +34,18 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.calibrations import Calibrations, Slopes
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
-from etid.results.instrument import Instrument
 from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, combined, reciprocal
 from etid.solvers.matrices import inverse_root
+
+FAULTS = 3  # errors of the instrument that change loads directly: gain, crosstalk, capacitance
 
 
 class UnloadedEstimate(NamedTuple):
@@ -84,7 +81,8 @@ class GivenDriver(eqx.Module):
         gain_slopes: Derivatives of these gains with respect to z.
         shape: Unloaded voltage of the first calibration; None if it cannot be compared.
         delay_width: Prior standard deviation of the trigger delay of a load [samples].
-        faults: Gain, crosstalk and capacitance by z; None if the instrument has no tolerances.
+        faults: Gain, crosstalk and capacitance at z = 0 and by z; None if the instrument has no
+            tolerances.
         by_current: Whether the input is a measured current: the gain is Z_L, and there is no z.
     """
 
@@ -100,7 +98,7 @@ class GivenDriver(eqx.Module):
     gain_slopes: Complex[Array, "z calibration known"] | None
     shape: UnloadedShape | None = None
     delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
-    faults: Float[Array, "z 3"] | None = None
+    faults: tuple[Float[Array, "3"], Float[Array, "z 3"]] | None = None
     by_current: bool = eqx.field(static=True, default=False)
 
     @classmethod
@@ -203,47 +201,26 @@ def given(
     c = calibrations.start()
     near = calibrations.near(c)
     linear = calibrations.linear(near)
-    root = inverse_root(linear.curvature().expected)
-    mean = -root.T @ calibrations.gradient(near, linear)
-    cov = linear.along(root).curvature().score
+    curvature, errors = linear.curvature().expected, calibrations.tolerances.size
+    known = c.size - errors
+    root = inverse_root(curvature[:known, :known])
+    mean = -root.T @ calibrations.gradient(near, linear)[:known]
+    cov = linear.along(jnp.pad(root, ((0, errors), (0, 0)))).curvature().score
     # Later changes of the driver and errors of the instrument are further z.
-    later, instrument = jnp.zeros((c.size, 0)), driver.instrument
+    later = jnp.zeros((known, 0))
     if driver.drift is not None:
         std = driver.drift_std()
-        later = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
-    shown = jnp.zeros((c.size, 0))
-    if instrument is not None:
-        changes = near.condensed.rows(_by_instrument(instrument, calibrations, near.slopes))
-        shown = -root @ (root.T @ linear.told(changes).T)
-    directions = jnp.concatenate([root, later, shown], axis=1)
-    others = c.size + later.shape[1]
-    more = directions.shape[1] - c.size
+        later = jnp.pad(jnp.diag(std), ((0, known - std.size), (0, 0)))
+    directions = jnp.concatenate([root, later, calibrations.following(linear)], axis=1)
+    more = directions.shape[1] - known
+    directions = jnp.concatenate([directions, jnp.eye(errors, known + more, known + more - errors)])
     mean = jnp.pad(mean, (0, more))
     cov = jax.scipy.linalg.block_diag(cov, jnp.eye(more))
     found = around(calibrations, c, directions, frequency, shared, mean, cov)
-    if found.gain_slopes is not None and more:  # the calibrations tell nothing about later changes
-        gain_slopes = found.gain_slopes.at[c.size : others].set(0.0)
-        if instrument is not None:
-            direct = _by_instrument(instrument, calibrations, calibrations.slopes(c))
-            gain_slopes = gain_slopes.at[-direct.shape[0] :].add(direct)
+    if found.gain_slopes is not None:  # the calibrations tell nothing about later changes
+        gain_slopes = found.gain_slopes.at[known : known + later.shape[1]].set(0.0)
         found = dataclasses.replace(found, gain_slopes=gain_slopes)
-    if instrument is not None:
-        room = (others, driver.calibration.r_load.size)
-        by_z = jnp.pad(jnp.diag(instrument.of_loads()), (room, (0, 0)))
-        found = dataclasses.replace(found, faults=by_z)
     return dataclasses.replace(found, shape=shape_of(driver, frequency))
-
-
-def _by_instrument(
-    instrument: Instrument, calibrations: Calibrations, at: Slopes
-) -> Complex[Array, "z record frequency"]:
-    """Changes of the gains of the calibrations by each error, at constant Z_th."""
-    r_load = as_complex(calibrations.calibration.r_load)[:, None]
-    turned = at.gains * (r_load + at.z) / r_load
-    each = as_complex(jnp.eye(r_load.shape[0]))[:, :, None] * (-at.by_z * at.z)[None]
-    of = as_complex(instrument.of_loads())[:, None, None]
-    together = jnp.stack([at.gains, turned, jnp.zeros_like(turned)]) * of
-    return jnp.concatenate([together, each * as_complex(jnp.asarray(instrument.r_load))])
 
 
 def around(
@@ -266,6 +243,10 @@ def around(
         of = calibrations.slopes(c)
         gains, known = of.gains, combined(directions.T, of.by_unknown.reshape(c.size, -1))
         known = known.reshape(-1, *gains.shape)
+    faults = None
+    if calibrations.instrument is not None:
+        sizes, along = calibrations.tolerances[:FAULTS], calibrations.errors(directions.T)
+        faults = sizes * calibrations.errors(c)[:FAULTS], along[:, :FAULTS] * sizes[None]
     return GivenDriver(
         frequency=frequency,
         loaded=loaded,
@@ -278,4 +259,5 @@ def around(
         gains=gains,
         gain_slopes=known,
         delay_width=calibrations.delay_width,
+        faults=faults,
     )

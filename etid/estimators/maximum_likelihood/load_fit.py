@@ -147,12 +147,16 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     )
     wrong = other.seen() | other.has_other_gain() | falling.seen()
     contradicts = of_scales.contradicts()[1:].any()
-    if driver.faults is not None:  # the prior of an error and the data differ by N(0, 1 − its var)
-        left = 1 - jnp.diagonal(information)[owned:]
-        tolerated = jnp.any(driver.faults != 0, axis=1) & (left > UNSEEN)
-        beyond = z**2 > BEYOND**2 * jnp.where(tolerated, left, jnp.inf)
-        contradicts |= beyond.any()
+    if driver.faults is not None:
+        tolerated = jnp.any(driver.faults[1] != 0, axis=1)
+        contradicts |= beyond(jnp.where(tolerated, z, 0.0), jnp.diagonal(information)[owned:])
     return Found(estimate, moved > FAR, wrong, contradicts)
+
+
+def beyond(z: Float[Array, " error"], variance: Float[Array, " error"]) -> Bool[Array, ""]:
+    """Whether an error of the instrument, in its standard deviations, contradicts its tolerance."""
+    left = 1 - variance  # the prior of an error and the data differ by N(0, 1 − its variance)
+    return jnp.any(z**2 > BEYOND**2 * jnp.where(left > UNSEEN, left, jnp.inf))
 
 
 def covariance_of_priors(load: Load, least: Minimum) -> Float[Array, "q q"]:
