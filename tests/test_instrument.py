@@ -16,6 +16,7 @@ from etid.circuits.impedance import parallel, series
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import given
+from etid.online.current import CurrentModel
 from etid.results.driver import ContinuousDriver, HarmonicDriver
 from etid.results.instrument import TOLERANCES
 from etid.simulation.scenes import Scene, Trial
@@ -27,6 +28,7 @@ DAMP = SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
 GAIN = etid.Instrument(gain=1e-3)
 ALL = etid.Instrument(gain=2e-3, r_load=2e-3, crosstalk=2e-3, capacitance=2e-12)
 DRAWS = 40
+CHARGE = 1e-7  # [C] of the size of a phase
 NORMAL_95 = scipy.stats.norm.ppf(0.975)
 
 
@@ -231,6 +233,39 @@ def test_tolerances_are_kept_in_files_of_fits(tmp_path):
     assert settings.instrument == ("crosstalk 0.002",)
 
 
+def tracked(calibration, skin, instrument=None):
+    """Logarithms of the elements and charge after the pulses of a record, and their variances."""
+    tracker = etid.Tracker.of(
+        etid.identify_driver(calibration, instrument=instrument), calibration, electrodes=1
+    )
+    state = tracker.start()
+    for v_out in tracker.pulses(skin.v_out[None]):
+        state = tracker.update(state, v_out)
+    fit = tracker.read(state)[0]
+    values, logs = np.asarray(fit.circuit.values()), fit.circuit.log_values()
+    with jax.enable_x64(True):
+        of = CurrentModel.of(tracker.model).current(fit.circuit, logs, jnp.zeros((3, 3)))
+    variances = np.diagonal(np.asarray(fit.cov)) / values**2
+    found = np.append(np.log(values), of.charge / CHARGE)
+    return fit, found, np.append(variances, (of.charge_stderr / CHARGE) ** 2)
+
+
+@pytest.mark.parametrize("skin", [DRY, DAMP], ids=["dry", "damp"])
+@pytest.mark.parametrize("source", TOLERANCES)
+def test_a_tracker_has_the_errors_of_the_instrument(source, skin):
+    size = TOLERANCES[source][1]
+    error: dict[str, Any] = {source: size}
+    _, before, without = tracked(*records(skin))
+    *_, stated = tracked(*records(skin), etid.Instrument(**error))
+    fit, after, _ = tracked(*records(skin, **error), etid.Instrument(**error))
+    assert fit.verdict == "successful"
+    added, moved = np.sqrt(stated - without), np.abs(after - before)
+    if source == "capacitance":  # more current flows, but not through the skin
+        added, moved = added[:-1], moved[:-1]
+    # What a tolerance adds is what an error of its size does, as in the budget of a fit.
+    np.testing.assert_allclose(added, moved, rtol=0.1, atol=0.05 * moved.max())
+
+
 REFUSED = {
     "etid.Instrument(gain=-1e-3)": "gain",
     "etid.Instrument(capacitance=5.0)": r"\[F\]",
@@ -238,7 +273,6 @@ REFUSED = {
     "etid.identify_driver(calibration, instrument=1e-3)": "instrument",
     "etid.identify_driver(calibration, instrument=ALL, method='output_error')": "output_error",
     "etid.identify_skin(skin, driver, method='output_error')": "output_error",
-    "etid.Tracker.of(driver, skin, electrodes=2)": "tracker",
 }
 
 

@@ -42,9 +42,9 @@ deviations, J its derivatives with respect to elements and delay, and d = G √w
 
 are the score of g and its information. Elements and delay are free in each pulse, so that the
 scores do not depend on how the skin varies. While g is 0, those of different pulses have the mean 0
-and the variance I, and are independent but for the error of Z_th and the noise of the unloaded
-record. This part of s, with the standard deviation c, does not average out. With the sums over the
-pulses since the electrode began anew,
+and the variance I, and are independent but for the error of Z_th, the tolerances of the instrument
+and the noise of the unloaded record. This part of s, with the standard deviation c, does not
+average out. With the sums over the pulses since the electrode began anew,
 
     z² = (Σs)² / (ΣI + (Σc)²)
 
@@ -202,8 +202,12 @@ class GainScore(NamedTuple):
         freedom = 2 * jnp.sum(pulse.weight > 0, dtype=score.dtype) - others.size - 1
         chi2 = (residual @ residual - score**2 / information) / freedom
         # ∂G/∂ log Z_th = −G (1 − G)
-        towards = jax.lax.complex(*jnp.split(d, 2)) * jnp.conj(weighted * (1 - gain))
+        free = jax.lax.complex(*jnp.split(d, 2))
+        towards = free * jnp.conj(weighted * (1 - gain))
         of_source = model.source_error.real @ towards.real + model.source_error.imag @ towards.imag
+        if model.faults is not None:
+            direct = as_complex(jnp.sqrt(pulse.weight))[None, :] * model.by_fault(gain)
+            of_source = of_source - model.faults @ (direct @ jnp.conj(free)).real
         of_x = power(gain) * model.bands.variance_x / variance
         common = jnp.sqrt(of_source @ of_source + d**2 @ jnp.tile(of_x, 2))
         # More noise than stated lessens the weight of a pulse, as it does in a fit of a record.

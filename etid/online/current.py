@@ -12,7 +12,9 @@ over bands.
 
 **Errors.** The tracker knows the gain G of the pulses better than the elements and Z_th apart. With
 G fixed, I = X (1 − G) / Z_th: an error δ log Z_th of the calibration makes an error −I δ log Z_th
-of the current. The noise of the pulses adds ∂I/∂ϑ = −X Y² ∂Z_L/∂ϑ, with Y = 1/(Z_L + Z_th).
+of the current. A gain g and a crosstalk κ of the instrument change the measured G by g G + κ, and
+so the current by I (g G + κ) / (1 − G); a capacitance C across the skin takes −I s C Z_L of it. The
+noise of the pulses adds ∂I/∂ϑ = −X Y² ∂Z_L/∂ϑ, with Y = 1/(Z_L + Z_th).
 
 The unloaded record has the bandwidth of its converter. A spike at an edge that is shorter than two
 samples is higher than its peak here.
@@ -26,7 +28,7 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.online.pulse_fit import GainModel, first_largest
-from etid.signals.transfer import reciprocal
+from etid.signals.transfer import frequency_variable, reciprocal
 
 EDGE = 24  # [samples] after each edge that are looked at in steps of `FINE`
 FINE = 0.5  # [samples]
@@ -56,6 +58,7 @@ class CurrentModel(eqx.Module):
         frequency: Centres of the bands [Hz].
         source: Z_th in each band [Ω].
         source_error: Errors of log Z_th by the calibrations, as in `GainModel`.
+        faults: Errors of the instrument, as in `GainModel`.
         sums: Weights w of the admittance in Re Σ w Y: row 0 for the charge [C Ω], the others for
             the current at `times` [A Ω].
         times: Times of the other rows after the start of the window [s].
@@ -66,6 +69,7 @@ class CurrentModel(eqx.Module):
     frequency: Float[Array, " band"]
     source: Complex[Array, " band"]
     source_error: Complex[Array, "z band"]
+    faults: Float[Array, "z 3"] | None
     sums: Complex[Array, "row band"]
     times: Float[Array, " time"]
     phase: float = eqx.field(static=True)
@@ -92,6 +96,7 @@ class CurrentModel(eqx.Module):
             frequency=bands.frequency,
             source=pulses.source,
             source_error=pulses.source_error,
+            faults=pulses.faults,
             sums=jnp.asarray(by_band),
             times=jnp.asarray(times / rate),
             phase=float((end - begin) / rate),
@@ -143,6 +148,10 @@ class CurrentModel(eqx.Module):
         rows = rows * admittance[None, :]
         charge, peak = rows.real.sum(axis=1)
         shared = _real(rows, self.source_error.T)
+        if self.faults is not None:
+            ratio = z * reciprocal(self.source)
+            direct = jnp.stack([ratio, 1 + ratio, -frequency_variable(self.frequency) * z])
+            shared = shared - _real(rows, direct.T) @ self.faults.T
         # Re Σ row Y² ∂Z/∂ϑ
         (own,) = jax.vmap(pulled)(rows * admittance[None, :])
         variance = jnp.sum((own @ cov) * own, axis=1)

@@ -22,7 +22,7 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_bands import Bands
 from etid.signals.harmonics import real_parts
-from etid.signals.transfer import as_complex, combined, power, reciprocal
+from etid.signals.transfer import as_complex, combined, frequency_variable, power, reciprocal
 from etid.solvers.matrices import inverse_of_few, root
 
 STEP = 0.1  # [samples] spacing of the grid of delays
@@ -65,6 +65,8 @@ class GainModel(eqx.Module):
         noise_freedom: Degrees of freedom of the variance of the noise.
         source_error: Errors of log Z_th by the calibrations: independent ones, each for a standard
             deviation of 1.
+        faults: Gain, crosstalk and capacitance of the instrument by the same errors; None if it has
+            no tolerances.
     """
 
     circuit: AbstractCircuit
@@ -75,6 +77,7 @@ class GainModel(eqx.Module):
     turns: Complex[Array, "delay band"]
     noise_freedom: Float[Array, ""]
     source_error: Complex[Array, "z band"]
+    faults: Float[Array, "z 3"] | None = None
 
     @classmethod
     def of(
@@ -92,8 +95,22 @@ class GainModel(eqx.Module):
         freedom = jnp.asarray(float(noise_freedom))
         loaded = source + as_complex(known.resistance)
         by_source = known.slope * (loaded * reciprocal(source))[None, :]
-        error = combined(root(known.cov).T, by_source)
-        return cls(circuit, bands, source, source_alias, turn, turns, freedom, error)
+        independent = root(known.cov).T
+        error = combined(independent, by_source)
+        faults = None if known.faults is None else independent @ known.faults[1]
+        return cls(circuit, bands, source, source_alias, turn, turns, freedom, error, faults)
+
+    def by_fault(self, gain: Complex[Array, " band"]) -> Complex[Array, "3 band"]:
+        """Changes of a gain by gain, crosstalk and capacitance of the instrument."""
+        # ∂G/∂C = −s Z_L² ∂G/∂Z_L
+        by_capacitance = -frequency_variable(self.bands.frequency) * self.source * gain**2
+        return jnp.stack([gain, jnp.ones_like(gain), by_capacitance])
+
+    def by_error(self, gain: Complex[Array, " band"]) -> Complex[Array, "z band"]:
+        """Changes of a gain by each independent error of calibrations and instrument."""
+        # ∂G/∂ log Z_th = −G (1 − G)
+        found = (gain * (gain - 1))[None, :] * self.source_error
+        return found if self.faults is None else found + combined(self.faults, self.by_fault(gain))
 
     def expected(self, logs: Float[Array, " element"]) -> "Expected":
         """The gain of a load, and its derivatives."""

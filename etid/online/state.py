@@ -162,9 +162,8 @@ def fit_of(
     pulse = Pulse(model, jnp.zeros_like(expected.gain), weight, logs, nothing)
     jacobian = pulse.jacobian(expected)
     by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
-    # ∂G/∂ log Z_th = −G (1 − G)
-    by_source = as_complex(jnp.sqrt(weight)) * expected.gain * (1 - expected.gain)
-    of_source = by_term @ real_parts(by_source[None, :] * model.source_error).T
+    by_error = as_complex(jnp.sqrt(weight))[None, :] * model.by_error(expected.gain)
+    of_source = by_term @ real_parts(by_error).T
     # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
     of_x = jnp.tile(power(expected.gain) * bands.variance_x / state.variance, 2)
     shared = of_source @ of_source.T + (by_term * of_x[None, :]) @ by_term.T

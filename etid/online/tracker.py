@@ -32,9 +32,10 @@ several such pulses in a row, and at once if it touches nothing.
 **Amplitude.** V_out is divided by the amplitude of its pulse, relative to that of the unloaded
 record. The driver is linear. `etid.online.alarms` says when the gain or the amplitude is wrong.
 
-Z_th comes from the calibrations only; the pulses do not change it. More pulses reduce neither its
-error nor the error from the noise of the unloaded record: both are in `shared_cov`. Calibrate with
-two resistors. One resistor leaves a delay open, which makes an error of one or two per cent in C_p.
+Z_th comes from the calibrations only; the pulses change neither it nor errors of the instrument.
+More pulses reduce none of these errors, nor that from the noise of the unloaded record: all are in
+`shared_cov`. Calibrate with two resistors. One resistor leaves a delay open, which makes an error
+of one or two per cent in C_p.
 """
 
 import dataclasses
@@ -154,11 +155,6 @@ class Tracker(Overviewed):
         if not (np.isfinite(change) and change >= 0):
             raise ValueError(f"change is {change}; it must be finite and not negative")
         driver = serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
-        if driver.instrument is not None:
-            raise ValueError(
-                "a tracker does not carry the tolerances of an instrument; identify the driver "
-                "without instrument="
-            )
         seen = Inspected(unloaded)
         name = preflight(seen, periodic=True) or ("biased" if seen.is_aliased else None)
         if name is not None:
