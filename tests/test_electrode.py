@@ -324,6 +324,14 @@ def test_a_gain_is_wrong_if_all_noise_and_one_that_does_not_matter_are_less(scor
 # --- changes --------------------------------------------------------------------------------------
 
 
+def test_an_element_that_changes_alone_is_named_however_well_the_others_are_known():
+    """(W e_i)_j² / W_jj is largest for j = i, by Cauchy and Schwarz."""
+    root = np.random.default_rng(0).normal(size=(3, 3)) * [[1.0], [30.0], [0.1]]
+    cov = jnp.asarray(root @ root.T)
+    for number, d in enumerate(jnp.eye(3)):
+        assert int(alarms.Innovation(d, jnp.linalg.inv(cov), cov).element()) == number
+
+
 def test_an_innovation_and_its_moving_mean_are_those_of_their_formulas():
     d, direction = np.array([0.3, -0.2]), np.array([1.0, -2.0])
     spread = np.linalg.inv(TOLD)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify.posterior import stretched
+from etid.identify.posterior import inside, stretched
 from etid.results.posterior import Profile
 from etid.solvers.importance_sampling import drawn, effective
 
@@ -48,6 +48,22 @@ def test_at_60_db_the_draws_have_the_errors_of_the_fit(clear, posterior):
     assert np.abs((mean - np.log(values)) / errors).max() < 0.15
     np.testing.assert_allclose(np.sqrt(np.diag(cov)), errors, rtol=0.1)
     assert np.abs(cov / np.outer(errors, errors) - fit.correlation).max() < 0.15
+
+
+def test_what_bounds_tell_of_the_elements_moves_the_others_as_their_covariance_says():
+    """E and var of the rest, given a normal distribution of the elements: the law of total ones."""
+    root = np.random.default_rng(0).normal(size=(5, 5))
+    cov, mean = root @ root.T, np.arange(5.0)
+    fit, *_ = identified(60.0, 0)
+    logs, told = np.asarray(fit.circuit.log_values()), 0.3 * cov[:3, :3]
+    values = np.asarray(fit.circuit.values())
+    fit = dataclasses.replace(fit, cov=told * np.outer(values, values))
+    centre, found = inside(fit, mean, cov, cov[:3, :3])
+    slope = cov[3:, :3] @ np.linalg.inv(cov[:3, :3])
+    alone = cov[3:, 3:] - slope @ cov[:3, 3:]
+    np.testing.assert_allclose(centre, [*logs, *(mean[3:] + slope @ (logs - mean[:3]))], rtol=1e-9)
+    np.testing.assert_allclose(found[:3, :3], told, rtol=1e-9)
+    np.testing.assert_allclose(found[3:, 3:], alone + slope @ told @ slope.T, rtol=1e-9)
 
 
 def test_draws_are_stretched_to_the_covariance_of_the_fit():

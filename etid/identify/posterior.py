@@ -150,7 +150,7 @@ def _stretch(
     return np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(cov[:size, :size]))
 
 
-def _inside(
+def inside(
     fit: Fit,
     mean: Float[np.ndarray, " q"],
     cov: Float[np.ndarray, "q q"],
@@ -198,7 +198,7 @@ def posterior(
             found[(value < low) | (value > high)] = np.inf
         return found
 
-    begin = _inside(fit, least, own, cov) if known.bounds else (least, own)
+    begin = inside(fit, least, own, cov) if known.bounds else (least, own)
     q, weights = drawn(costs, *begin, draws, np.random.default_rng(seed))
     if not np.isfinite(weights).all():
         raise ValueError(f"the recording does not determine all elements of {fit}")
