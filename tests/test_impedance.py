@@ -16,6 +16,7 @@ PUBLISHED = {
 }
 DRAWS = 60  # of fits that take 50 ms; an error of a third too small is seen
 DRY = etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+FEW = np.geomspace(100.0, 1e5, 6)
 
 
 def zplot(path):
@@ -85,6 +86,29 @@ def test_intervals_hold_the_truth(size):
         inside.append(np.abs(error) < 1.96 * np.asarray(fit.stderr.values()))
     assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / DRAWS)).all()
     assert size is not None or abs(np.mean(chi2) - 1) < 3 * np.sqrt(2 / 97 / DRAWS)
+
+
+def test_few_points_determine_themselves_and_the_errors_know_it():
+    """Of 12 numbers three are fitted: the residual has three quarters of the noise's variance."""
+    rng, z, off = np.random.default_rng(0), np.asarray(DRY.response(FEW)), []
+    for _ in range(DRAWS):
+        noise = 0.01 * np.abs(z) * (rng.normal(size=6) + 1j * rng.normal(size=6))
+        fit = etid.identify_impedance(FEW, z + noise)
+        error = np.asarray(fit.circuit.values()) - np.asarray(DRY.values())
+        off.append(error / np.asarray(fit.stderr.values()))
+    # 180 numbers, of which some 120 are independent: three standard errors of their size.
+    assert abs(np.sqrt(np.mean(np.square(off))) - 1) < 0.2
+
+
+def test_noise_that_is_told_too_small_is_a_misfit_with_errors_as_large_as_it_is():
+    frequency, z = relative(DRY, 1e-2, 0)
+    half, third = (
+        etid.identify_impedance(frequency, z, stderr=1e-2 * np.abs(z) / part, throw=False)
+        for part in (2, 3)
+    )
+    assert half.verdict == third.verdict == "misfit"
+    np.testing.assert_allclose(third.chi2 / half.chi2, 9 / 4, rtol=1e-6)
+    np.testing.assert_allclose(third.cov, half.cov, rtol=1e-4)
 
 
 def kiloohm(z):

@@ -75,6 +75,16 @@ def test_a_variation_that_is_there_is_found_and_one_that_is_not_is_zero(fits):
     assert "between subjects" in str(found)
 
 
+def test_an_error_that_all_fits_share_is_none_of_their_variation(fits):
+    """The driver's error moves all elements by one factor, and hides no variation between them."""
+    shared = 50 * fits.cov
+    fit = dataclasses.replace(fits.fit, cov=fits.cov + shared, shared_cov=shared)
+    found, alone = (etid.variation(of, "r_p") for of in (dataclasses.replace(fits, fit=fit), fits))
+    assert found.error == pytest.approx(alone.error)
+    parts = [list(of.between.values()) for of in (found, alone)]
+    np.testing.assert_allclose(parts[0], parts[1], rtol=1e-3, atol=1e-6)  # the search's tolerance
+
+
 @pytest.mark.parametrize(
     ("element", "by", "error", "message"),
     [
