@@ -122,21 +122,23 @@ def fitted():
     driver = etid.identify_driver(study["c"])
     kept_numbers.check("driver_in_time", kept_numbers.of_driver(driver))
 
-    def of(scale, late=driver.calibration.delay_std_samples):
+    def of(scale, late=driver.calibration.delay_std_samples, **other):
         lane = PaddedSamples.of(Inspected(study["a"]))
         told = jax.tree.map(jnp.asarray, lane)
         lane = dataclasses.replace(
             told, sigma_th=scale * told.sigma_th, sigma_out=scale * told.sigma_out
         )
-        told = eqx.tree_at(lambda of: of.calibration.delay_std_samples, driver, jnp.asarray(late))
-        return skin(lane, told, None, etid.SkinRC(), OUTPUT_ERROR)
+        known = eqx.tree_at(lambda of: of.calibration.delay_std_samples, driver, jnp.asarray(late))
+        known = dataclasses.replace(known, **other)
+        return skin(lane, known, None, etid.SkinRC(), OUTPUT_ERROR)
 
-    return of
+    return driver, of
 
 
 def test_if_the_noise_is_larger_than_it_is_said_to_be_the_errors_are_as_large(fitted):
     """χ² grows as the noise that is assumed falls, and the errors by it remain."""
-    third, tenth = fitted(1 / 3), fitted(1 / 10)
+    _, fit_of = fitted
+    third, tenth = fit_of(1 / 3), fit_of(1 / 10)
     kept_numbers.check("in_time_too_noisy", kept_numbers.of_fit(third))
     assert float(third.chi2) > 5
     np.testing.assert_allclose(tenth.chi2 / third.chi2, 100 / 9, rtol=1e-3)
@@ -147,7 +149,8 @@ def test_if_the_noise_is_larger_than_it_is_said_to_be_the_errors_are_as_large(fi
 
 
 def test_if_the_noise_is_smaller_the_errors_are_what_it_is_said_to_be(fitted):
-    once, twice = fitted(1.5), fitted(3.0)
+    _, fit_of = fitted
+    once, twice = fit_of(1.5), fit_of(3.0)
     kept_numbers.check("in_time", kept_numbers.of_fit(once))
     assert float(once.chi2) < 1
     own = [np.asarray(fit.cov - fit.shared_cov) for fit in (once, twice)]
@@ -157,8 +160,9 @@ def test_if_the_noise_is_smaller_the_errors_are_what_it_is_said_to_be(fitted):
 
 def test_the_delay_of_the_calibration_is_known_as_well_as_its_standard_deviation_says(fitted):
     """One parameter with information c and prior 1/s²: cov = A + b bᵀ / (1/s² + c)."""
+    _, fit_of = fitted
     known, *others = (
-        np.diagonal(np.asarray((fit := fitted(1.5, late)).cov - fit.shared_cov))
+        np.diagonal(np.asarray((fit := fit_of(1.5, late)).cov - fit.shared_cov))
         for late in (1e-6, 0.01, 0.02, 1e3)
     )
     first, second, free = (cov - known for cov in others)
@@ -166,6 +170,14 @@ def test_the_delay_of_the_calibration_is_known_as_well_as_its_standard_deviation
     element = np.argmax(free / known)
     ratio = (free[element] / first[element] - 1) / (free[element] / second[element] - 1)
     assert ratio == pytest.approx(4, rel=0.1)
+
+
+def test_a_driver_that_drifts_is_one_that_is_known_less(fitted):
+    driver, fit_of = fitted
+    drifting = dataclasses.replace(driver, drift=jnp.asarray(0.01))
+    drifts, less = fit_of(1.5, drift=drifting.drift), fit_of(1.5, cov=drifting.later_cov())
+    np.testing.assert_allclose(drifts.shared_cov, less.shared_cov, rtol=1e-6)
+    assert (np.diagonal(drifts.shared_cov) > 2 * np.diagonal(fit_of(1.5).shared_cov)).any()
 
 
 def test_errors_of_a_driver_that_misses_its_calibration_are_as_large_as_it_does():
