@@ -14,7 +14,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import SkinCurrent, current_dependent
 from etid.estimators import judgement
 from etid.estimators.amplitudes.fit import fit_amplitudes
-from etid.estimators.amplitudes.terms import Amplitudes, currents
+from etid.estimators.amplitudes.terms import Amplitudes, currents, with_filter
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
@@ -72,7 +72,7 @@ def _fit(
     bounds: Limits,
 ) -> Fit:
     rate = jnp.asarray(lanes.sample_rate)[0]
-    of = Amplitudes(known, feed, circuit, lanes.spectrum, rate, prior)
+    of = Amplitudes(with_filter(known), feed, circuit, lanes.spectrum, rate, prior)
     estimate = fit_amplitudes(of)
     fit = judgement.judged(estimate, circuit, feed.result, METHOD, bounds)
     fit = judgement.unless(fit, leaves_much(estimate.chi2, estimate.rrse), RESULTS.misfit)
@@ -95,11 +95,9 @@ def identify_amplitudes(
 
     All recordings have the same elements. The method is maximum likelihood on the harmonics; the
     response of a resistor that depends on its current is computed by harmonic balance, from the
-    record of V_th or of the current. Two things make I_0 and R_s wrong that a linear load does not
-    notice. An anti-alias filter that changes the edges of the record inside the band: with the
-    values of Kaczmarek and Webster at 60 dB, I_0 is wrong by 1 % and R_s by 8 % at 200 kHz, and
-    both by less than 0.1 % at 500 kHz. A measured current with a direct component, which the
-    harmonics do not contain: stimulate with charge-balanced pulses.
+    record of V_th or of the current. The anti-alias filter of the converter is estimated too. A
+    measured current must not have a direct component, which the harmonics do not contain: stimulate
+    with charge-balanced pulses.
 
     Args:
         recordings: Recordings of the same load, of equal length and sample rate, each of several

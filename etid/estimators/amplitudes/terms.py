@@ -7,6 +7,17 @@ are those of `etid.estimators.maximum_likelihood.profile`, but the load need not
 
 If the load has a resistor that depends on its current, harmonic balance gives V(X).
 
+**The anti-alias filter** H of a converter shapes both records. A linear load does not notice: H is
+in X and in Y. A load that depends on its current does. It acts on what the filter has not changed
+yet, so that Y = H V(X/H). Without H, C_p is up to 1 % wrong at 200 kHz, and 15 standard errors at
+60 dB. The filter is not known. So its logarithm is a sum of those of usual filters H_m, with
+unknown weights that all records share,
+
+    Y_k − H_k V_k(X/H) e^(−jω_k τ),      log H = Σ_m ε_m log H_m,      ε_m ~ N(0, 1).
+
+ε = 0 is a converter that changes nothing below half its sample rate. The ε are further z, which
+change no Z_th (`etid.estimators.maximum_likelihood.given_driver`).
+
 The weights are constant: a fit gets the variances of the terms from earlier estimates. If they
 followed the parameters, elements with a large gain would explain any residual by the noise of X,
 because a saturated V(X) hardly changes with them. The terms are treated as independent, which the
@@ -14,6 +25,7 @@ last step corrects (`etid.estimators.amplitudes.last_step`).
 """
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
@@ -39,6 +51,8 @@ STILL = 1e-6  # of the pulse rate; stands for 0 Hz, where a series capacitor has
 # A linear load would have an infinite I_0. The prior of its logarithm keeps it finite; its standard
 # deviation is a factor of 150.
 CURRENT_WIDTH = 5.0
+# Corners of usual anti-alias filters, Butterworth's of fourth order, relative to the sample rate.
+CORNERS = (0.4, 0.3)
 
 
 class Amplitudes(eqx.Module):
@@ -176,7 +190,11 @@ class Amplitudes(eqx.Module):
         self, own: Float[Array, " own"], spectrum: Spectrum
     ) -> Complex[Array, " harmonic"]:
         """Fourier coefficients of V_out [V] of a record."""
-        return self.turned(own, self.loaded(own, spectrum), spectrum)
+        _, _, z = self.gain(spectrum).split(own)
+        logs = _log_filters(spectrum.frequency / self.sample_rate)
+        passed = jnp.exp(as_complex(z[-logs.shape[0] :]) @ logs)
+        before = eqx.tree_at(lambda s: s.x, spectrum, spectrum.x * reciprocal(passed))
+        return self.turned(own, passed * self.loaded(own, before), spectrum)
 
     @property
     def weight(self) -> Float[Array, "record harmonic"]:
@@ -218,6 +236,27 @@ class Amplitudes(eqx.Module):
             return value, jnp.concatenate([by_other.T[:first], rows, by_other.T[first:]])
 
         return jax.lax.map(one, (jnp.arange(self.count), self.spectra))
+
+
+def with_filter(given: GivenDriver) -> GivenDriver:
+    """The same with the weights ε of the anti-alias filters as the last z."""
+    of, more = given.faults, len(CORNERS)
+    return dataclasses.replace(
+        given,
+        slope=jnp.pad(given.slope, ((0, more), (0, 0))),
+        mean=jnp.pad(given.mean, (0, more)),
+        cov=jax.scipy.linalg.block_diag(given.cov, jnp.eye(more)),
+        faults=None if of is None else jnp.pad(of, ((0, more), (0, 0))),
+    )
+
+
+def _log_filters(position: Float[Array, " harmonic"]) -> Complex[Array, "corner harmonic"]:
+    """Logarithms of the filters H at frequencies relative to the sample rate."""
+    u = position[None, :] / jnp.asarray(CORNERS)[:, None]
+    pairs = [
+        jnp.log(jax.lax.complex(1 - u * u, 2 * math.sin(math.pi * odd / 8) * u)) for odd in (1, 3)
+    ]
+    return -pairs[0] - pairs[1]
 
 
 def currents(circuit: AbstractCircuit) -> Bool[np.ndarray, " element"]:
