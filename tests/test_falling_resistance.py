@@ -11,7 +11,7 @@ import etid
 from benchmarks.laboratory import SCALE, Record
 from benchmarks.perturbation_list import PERTURBATIONS
 from benchmarks.perturbed_study import nonlinear, undisturbed
-from etid.estimators.score_tests.falling_resistance import SEEN, added_voltage
+from etid.estimators.score_tests.falling_resistance import added_voltage
 from etid.recordings.remarks import Remark
 from etid.signals.knots import knots
 
@@ -111,5 +111,4 @@ def test_linear_skin_is_not_called_nonlinear():
         for number in range(5)
         for snr in (30.0, 40.0, 60.0, 80.0)
     ]
-    assert SEEN == 4.0
     assert sum(fallen(one).sum() for one in fits) == 0

@@ -246,7 +246,7 @@ def with_filter(given: GivenDriver) -> GivenDriver:
         slope=jnp.pad(given.slope, ((0, more), (0, 0))),
         mean=jnp.pad(given.mean, (0, more)),
         cov=jax.scipy.linalg.block_diag(given.cov, jnp.eye(more)),
-        faults=None if of is None else jnp.pad(of, ((0, more), (0, 0))),
+        faults=None if of is None else (of[0], jnp.pad(of[1], ((0, more), (0, 0)))),
     )
 
 

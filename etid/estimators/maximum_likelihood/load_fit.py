@@ -21,7 +21,7 @@ from etid.estimators.maximum_likelihood.load import Load, by_falling, changes
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import best_start, minimum
 from etid.estimators.sandwich import Linear
-from etid.estimators.score_tests import falling_resistance, other_circuit
+from etid.estimators.score_tests import SEEN, falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
 from etid.results.fit import Fit, Support
@@ -34,7 +34,6 @@ from etid.solvers.successive import Minimum
 # Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
 # 200 fits were wrong by five standard errors; both exceed it.
 FAR = 0.5
-BEYOND = 3.9  # standard deviations of an error of the instrument: by chance once in ten thousand
 UNSEEN = 1e-3  # of the variance of its prior, below which a recording tells nothing about an error
 NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
 
@@ -156,7 +155,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
 def beyond(z: Float[Array, " error"], variance: Float[Array, " error"]) -> Bool[Array, ""]:
     """Whether an error of the instrument, in its standard deviations, contradicts its tolerance."""
     left = 1 - variance  # the prior of an error and the data differ by N(0, 1 − its variance)
-    return jnp.any(z**2 > BEYOND**2 * jnp.where(left > UNSEEN, left, jnp.inf))
+    return jnp.any(z**2 > SEEN**2 * jnp.where(left > UNSEEN, left, jnp.inf))
 
 
 def covariance_of_priors(load: Load, least: Minimum) -> Float[Array, "q q"]:

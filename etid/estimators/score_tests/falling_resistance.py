@@ -16,12 +16,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.profile import Profile
+from etid.estimators.score_tests import SEEN
 from etid.estimators.score_tests.other_circuit import MOVED
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, power, reciprocal
 
-# Standard deviations; one-sided, so that a linear load exceeds it once in 30 000.
-SEEN = 4.0
 NO_FALL = (  # for a methods section
     "a score test finds no resistance of the load that falls with its current (at most "
     f"{SEEN:g} standard deviations)"

@@ -33,15 +33,12 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.sandwich import Linear
+from etid.estimators.score_tests import SEEN
 from etid.signals.transfer import as_complex, frequency_variable
 
-# Standard deviations. By chance the spread exceeds its limit in one fit of 16 000. The fast
-# relaxations have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for six poles), so 5 is in fact 4.
-SEEN_SPREAD, SEEN_RELAXATION = 4.0, 5.0
-# Standard deviations of a wrong gain. None of 1500 undisturbed fits from 30 to 60 dB exceeds it and
-# has an element that it moves. A gain that is 1 % wrong has five standard deviations at 40 dB, and
-# makes R_p of dry skin a quarter too large.
-SEEN_GAIN = 3.0
+# Standard deviations. The fast relaxations have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for
+# six poles), so that 5 is in fact `SEEN`.
+SEEN_RELAXATION = 5.0
 # α or ε must also deviate by this, which changes R_s by a few per cent. A driver whose order is too
 # low can imitate 0.002: four standard deviations at 60 dB with damp skin.
 SPREAD = 0.01
@@ -49,16 +46,15 @@ MOVED = 0.02  # relative change of an element that is also necessary, for the sa
 # For a methods section.
 NO_OTHER_CIRCUIT = (
     "score tests find no relaxation of the load that is spread over time constants (at most "
-    f"{SEEN_SPREAD:g} standard deviations) and no further relaxation (at most {SEEN_RELAXATION:g})"
+    f"{SEEN:g} standard deviations) and no further relaxation (at most {SEEN_RELAXATION:g})"
 )
 NO_OTHER_GAIN = (
     "a score test finds no difference between the gains of the two records (at most "
-    f"{SEEN_GAIN:g} standard deviations)"
+    f"{SEEN:g} standard deviations)"
 )
-# Standard deviations and relative change of an element, from which on the scale of a current
-# measured beside V_th is wrong. By chance one fit in 16 000 exceeds the first; a driver of too low
-# order can imitate less than the second.
-DISAGREES, SCALE = 4.0, 1e-3
+# Relative change of an element, from which on the scale of a current measured beside V_th is wrong.
+# A driver of too low order can imitate less.
+SCALE = 1e-3
 GRID = 7  # time constants, two per decade; a relaxation is wider than that
 BEYOND = 2.0  # factor by which they exceed the band
 NOTHING = 1e-9  # of the power of a change; rounding leaves less of one that the circuit can make
@@ -121,7 +117,7 @@ class Score(NamedTuple):
 
     def contradicts(self) -> Bool[Array, "*change"]:
         """Whether the scale of a measured current is wrong; all changes must be such scales."""
-        return (jnp.abs(self.z) > DISAGREES) & (self.moved > SCALE)
+        return (jnp.abs(self.z) > SEEN) & (self.moved > SCALE)
 
     def relaxes(self) -> Bool[Array, ""]:
         """Whether one more relaxation is seen; all changes must be relaxations."""
@@ -152,7 +148,7 @@ class Scores(NamedTuple):
 
     def seen(self) -> Bool[Array, ""]:
         """Whether the scores show another circuit."""
-        spread = (jnp.abs(self.spread.z) > SEEN_SPREAD) & (jnp.abs(self.spread.size) > SPREAD)
+        spread = (jnp.abs(self.spread.z) > SEEN) & (jnp.abs(self.spread.size) > SPREAD)
         return spread | self.relaxation.relaxes()
 
     def relevant(self) -> Float[Array, " change"]:
@@ -164,7 +160,7 @@ class Scores(NamedTuple):
 
     def has_other_gain(self) -> Bool[Array, ""]:
         """Whether the score shows that V_out and V_th have different gains."""
-        return jnp.asarray(False) if self.gain is None else self.gain.exceeds(SEEN_GAIN)
+        return jnp.asarray(False) if self.gain is None else self.gain.exceeds(SEEN)
 
 
 def scores(

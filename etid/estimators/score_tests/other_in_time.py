@@ -48,6 +48,7 @@ from etid.estimators.output_error.prediction import (
     residual_variance,
 )
 from etid.estimators.sandwich import Linear
+from etid.estimators.score_tests import SEEN
 from etid.estimators.score_tests.other_circuit import Score, relaxations, scores
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance
@@ -59,9 +60,6 @@ from etid.solvers.matrices import inverse
 # [Hz] Faster relaxations resemble delays and the fast poles of the driver. At 40 dB these poles are
 # more uncertain than a linear distribution allows: one of three damp skins had z = 13 at 140 kHz.
 HIGHEST = 5e3
-# Standard deviations. Behind a measured current no pole is uncertain, and z is normal: by chance,
-# the largest of ten changes exceeds this in at most one fit of a thousand.
-SEEN = 3.9
 SHIFTED = 2.0  # standard errors by which a change that counts moves an element
 # Effective value of a change that counts, relative to the signal. The errors of the interpolation
 # and of the ladder of a constant phase look like a change in part: at 80 dB, |z| > 3.9 refused 6 of
