@@ -8,6 +8,7 @@ import scipy.stats
 
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
+from etid.estimators.score_tests import FALSE_ALARMS
 from etid.identify import changes
 from etid.recordings.preflight import Inspected
 from etid.recordings.repeats import repeats
@@ -85,7 +86,7 @@ def test_the_standard_errors_of_changes_are_what_the_changes_scatter_by():
 def test_a_threshold_is_exceeded_as_rarely_as_it_says():
     for freedom, count in ((1, 3), (4, 16)):
         rare = scipy.stats.chi2.sf(changes.threshold(freedom, count), freedom)
-        np.testing.assert_allclose(rare, changes.ALARM / count, rtol=1e-6)
+        np.testing.assert_allclose(rare, FALSE_ALARMS / count, rtol=1e-6)
 
 
 def test_a_step_and_a_single_period_are_seen_as_well_as_a_line():
@@ -117,7 +118,7 @@ def test_courses_are_a_line_each_step_and_each_single_period():
 def test_an_element_that_moves_alone_is_seen_where_all_together_hide_it():
     """One of the records at 40 dB in which R_p falls by 5 % and χ² of all four is too small."""
     scene, skin = rung("dry", snr_db=40.0), LOADS["dry"]
-    assert change_of(recorded(scene, falling(skin, "r_p", 0.05), seed=36), scene, skin).seen
+    assert change_of(recorded(scene, falling(skin, "r_p", 0.05), seed=29), scene, skin).seen
 
 
 def test_noise_that_is_larger_between_periods_than_within_is_no_change():
@@ -179,12 +180,12 @@ def test_cuts_between_samples_leave_the_amplitude_of_v_th_alone(rate):
 @pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [20.0, 30.0, 80.0])
 def test_false_alarms_are_as_rare_as_they_are_said_to_be(snr_db):
-    """One is expected in this many recordings; more than six have a probability of 8e-5."""
-    load, count = LOADS["dry"], round(1 / changes.ALARM)
+    """A tenth is expected in 1000 recordings; more than two have a probability of 2e-4."""
+    load, count = LOADS["dry"], round(0.1 / FALSE_ALARMS)
     trials = tuple(Trial(str(number), load) for number in range(count))
     scene = dataclasses.replace(rung("dry", snr_db=snr_db), trials=trials, calibration=())
     seen = (change_of(one, scene, load).seen for one in scene.simulate(seed=1).values())
-    assert sum(map(bool, seen)) <= 6
+    assert sum(map(bool, seen)) <= 2
 
 
 @pytest.mark.parametrize("frequency", [1.0, 50.0])

@@ -31,6 +31,7 @@ import scipy
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.score_tests import FALSE_ALARMS
 from etid.numpy_tier.tiers import program
 from etid.recordings.repeats import ALIGNED, Repeats
 from etid.results.driver import Driver
@@ -40,8 +41,6 @@ from etid.results.verdicts import verdict
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import frequency_variable, reciprocal
 
-# Probability of a false alarm in a record without a change. From 20 to 80 dB, 15 of 22 000 had one.
-ALARM = 1e-3
 CLEAN = 0.03  # of the sample rate; below, there are no aliases
 UNEQUAL = 5e-4  # largest change of the amplitude of V_th; cuts between samples cause 1e-4
 EXPLAINED = (
@@ -110,8 +109,8 @@ def courses(periods: int) -> Float[np.ndarray, "course period"]:
 
 @functools.lru_cache(maxsize=64)
 def threshold(freedom: int, count: int) -> float:
-    """Threshold that the largest of `count` values of χ² exceeds with the probability `ALARM`."""
-    return float(scipy.special.chdtri(freedom, ALARM / count))
+    """Threshold that the largest of `count` χ² exceeds with the probability `FALSE_ALARMS`."""
+    return float(scipy.special.chdtri(freedom, FALSE_ALARMS / count))
 
 
 def found(
