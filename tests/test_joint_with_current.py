@@ -100,21 +100,32 @@ def test_a_lag_of_one_record_is_taken_off(pair, name, late):
 
 
 def test_the_tolerance_of_the_known_resistor_is_what_the_current_leaves_of_it(pair, joint):
-    """Its effect is that of another resistor; without a current it is 1 : 1."""
+    """A budget has the effect of another resistor; the fit finds the resistor by its tolerance."""
     calibration, recording = pair
     wrong = 3e-3
     other = calibration.replace(r_load=(1 + wrong) * calibration.r_load)
-    moved = values(jointly([other, recording]).fits[0]) / values(joint.fits[0]) - 1
-    doubtful = jointly(pair, r_load_tolerance=wrong).fits[0]
-    added = np.diagonal(doubtful.cov - joint.fits[0].cov) / values(doubtful) ** 2
+    contradicted = jointly([other, recording]).fits[0]
+    assert contradicted.verdict == "inconsistent"
+    moved = values(contradicted) / values(joint.fits[0]) - 1
+    budgeted = jointly(pair, instrument=etid.Instrument())
+    (driver,) = budgeted.drivers.values()
+    told = budgeted.fits[0].budget(recording, driver).unstated["r_load"] * wrong / 1e-3
     # 2nd order of a change of 0.3 %, whose own effect the fits find to a few per cent.
-    np.testing.assert_allclose(np.sqrt(added), np.abs(moved), rtol=0.05, atol=1e-5)
-    assert (np.sqrt(added) < 0.9 * wrong).all()
-    np.testing.assert_allclose(
-        np.diagonal(doubtful.shared_cov - joint.fits[0].shared_cov) / values(doubtful) ** 2,
-        added,
-        rtol=1e-6,
+    np.testing.assert_allclose(told, np.abs(moved), rtol=0.05, atol=1e-5)
+    assert (told < 0.9 * wrong).all()
+
+    tolerance = etid.Instrument(r_load=wrong)
+    doubtful, found = (
+        jointly([known, recording], instrument=tolerance).fits[0] for known in (calibration, other)
     )
+    assert (doubtful.verdict, found.verdict) == ("successful", "successful")
+    assert (np.abs(values(found) - values(doubtful)) < 0.02 * errors(doubtful)).all()
+    added = np.diagonal(doubtful.cov - joint.fits[0].cov) / values(doubtful) ** 2
+    assert (added > 0).all()
+    # The current shows its scale to a tenth of this tolerance.
+    assert (np.sqrt(added) < 0.2 * told).all()
+    shared = np.diagonal(doubtful.shared_cov - joint.fits[0].shared_cov) / values(doubtful) ** 2
+    np.testing.assert_allclose(shared, added, rtol=0.1)
 
 
 def test_intervals_of_joint_estimates_are_true():

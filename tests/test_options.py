@@ -107,8 +107,9 @@ def test_all_functions_of_studies_take_the_same_options(study, source, fitted):
 
 def test_a_tolerance_that_no_fit_would_contain_is_refused(source, tmp_path, capsys):
     target = tmp_path / "fits.h5"
-    assert cli.main(["fit", str(source), "-o", str(target), "--r-load-tolerance", "0.01"]) == 1
-    assert "add --joint, or remove it" in capsys.readouterr().err
+    command = ["fit", str(source), "-o", str(target), "--method", "output_error"]
+    assert cli.main([*command, "--tolerance", "r_load=0.01"]) == 1
+    assert "are parameters of maximum likelihood" in capsys.readouterr().err
     assert not target.exists()
 
 
@@ -120,4 +121,7 @@ def test_files_of_fits_store_the_options_and_older_files_are_read(fitted, tmp_pa
     older.write_bytes(fitted.read_bytes())
     with h5py.File(older, "r+") as content:
         del content.attrs["plausible"]
-    assert stored(older) == dataclasses.replace(settings, plausible=PLAUSIBLE)
+        content.attrs["r_load_tolerance"] = 0.01
+    assert stored(older) == dataclasses.replace(
+        settings, plausible=PLAUSIBLE, instrument=("r_load 0.01",)
+    )

@@ -128,8 +128,8 @@ etid.fit_file('absent.h5', 'fits.h5', plausible=(1.0, 1.0)) -> plausible: is \(1
 etid.identify_study(of.study, driver_drift=-0.1) -> driver_drift is \-0\.1; it must be at least 0
 etid.fit_file('absent.h5', 'fits.h5', driver_drift=1.0) -> driver_drift is 1\.0; it must be
 etid.identify_study(of.study, method='equation_error', driver_drift=0.1) -> gives none
-etid.identify_jointly(of.study, r_load_tolerance=-0.1) -> r_load_tolerance is \-0\.1; it must be
-etid.identify_jointly(of.study, r_load_tolerance=np.nan) -> r_load_tolerance is nan; it must be
+etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=-0.1)) -> r_load .* is \-0\.1; it
+etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=np.nan)) -> r_load .* is nan; it
 etid.identify_study(of.study, method='equation_error', fixed={'r_s': 1.0}) -> no known elements
 etid.identify_study(of.study, circuit='R0-p(R1') -> 'R0\-p\(R1' is no circuit: cannot read
 etid.identify_skin(of.skin, circuit='R0-R0') -> has R0 twice

@@ -425,7 +425,7 @@ def test_the_methods_are_told_in_120_words_and_in_full_behind_them(found, study_
 @pytest.mark.parametrize("method", [*registry.names(), "joint", "online", TWO])
 def test_methods_cite_what_they_name_and_say_the_settings(found, method):
     fit = dataclasses.replace(found.fits.fit, method=method)
-    told = {"order": 4, "r_load_tolerance": 0.001, "instrument": ("gain 0.001",)}
+    told = {"order": 4, "instrument": ("gain 0.001", "r_load 0.001")}
     settings = dataclasses.replace(found.settings, **told)
     by = method.partition(" + ")[0]
     drivers = {
@@ -446,8 +446,8 @@ def test_methods_cite_what_they_name_and_say_the_settings(found, method):
     for version in settings.versions:
         assert version in section.details
     without_errors = method in ("steiglitz_mcbride", "equation_error")
-    assert ("tolerance of 0.1 %" in section.details) != without_errors
-    assert ("gain 0.001" in section.details) != without_errors
+    assert ("gain 0.001, r_load 0.001" in section.details) != without_errors
+    assert "do not contain the tolerance" not in section.details
     assert ("gives no standard errors" in section.details) == without_errors
 
 

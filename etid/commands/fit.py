@@ -105,14 +105,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="fit each driver together with its recordings, by maximum likelihood",
     )
-    parser.add_argument(
-        "--r-load-tolerance",
-        type=float,
-        default=0.0,
-        metavar="PART",
-        help="relative standard deviation of the known resistors, such as 0.001, for --joint; "
-        "default 0",
-    )
     parser.add_argument("--resume", action="store_true", help="continue a run that was killed")
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
@@ -205,10 +197,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ValueError(f"--joint uses maximum_likelihood; remove --method {arguments.method}")
     if arguments.joint and arguments.driver_drift:
         raise ValueError("--joint identifies the driver itself; remove --driver-drift")
-    if arguments.r_load_tolerance and not arguments.joint:
-        raise ValueError(
-            "--r-load-tolerance enters the standard errors of joint fits; add --joint, or remove it"
-        )
     if arguments.joint and arguments.driver:
         raise ValueError("--joint identifies the driver itself; remove --driver, or --joint")
     options = {
@@ -228,7 +216,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 study,
                 **options,
                 order=5 if arguments.order is None else arguments.order,
-                r_load_tolerance=arguments.r_load_tolerance,
                 progress=progress,
             )
             outcome.write(arguments.target)

@@ -132,22 +132,11 @@ def _together(
     groups: list[Loads],
     several: tuple[int, ...],
     driver: HarmonicDriver,
-    tolerance: Array,
 ) -> tuple[list[Fit], HarmonicDriver, list[Delay], Float[Array, "common common"]]:
     common, cov, found = fit_together(model, groups, several)
-    # Voltages determine all impedances in units of the known resistor, currents in ohms.
-    power, _ = model.circuit.scaling()
 
     def fit(found: Found) -> Fit:
-        estimate = found.estimate
-        moved = power + found.by_scale  # a measured current holds the elements back, or a prior
-        if model.prior is not None:
-            moved = moved - estimate.cov @ (model.prior.precision * power)
-        scale = tolerance**2 * jnp.outer(moved, moved)
-        with_scale = dataclasses.replace(
-            estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
-        )
-        fit = judgement.judged(with_scale, model.circuit, driver.result, METHOD, model.bounds)
+        fit = judgement.judged(found.estimate, model.circuit, driver.result, METHOD, model.bounds)
         if driver.instrument is not None:
             fit = dataclasses.replace(fit, by_tolerance=by_tolerance(found.by_error.T))
         fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)
@@ -308,7 +297,6 @@ def identify_jointly(
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
     instrument: Instrument | None = None,
-    r_load_tolerance: float = 0.0,
     plausible: tuple[float, float] = PLAUSIBLE,
     progress: bool = False,
 ) -> StudyFits:
@@ -333,16 +321,14 @@ def identify_jointly(
         instrument: Tolerances of the instrument, as in `identify_driver`; errors of one driver are
             common to its calibrations and all its recordings. With `etid.Instrument()`, which has
             none, `fit.budget` shows what they would add.
-        r_load_tolerance: Relative standard deviation of the known resistors. No record shows this
-            error. It passes 1:1 into every resistance and inversely into every capacitance.
         plausible: As in `identify_driver`.
         progress: Show a progress bar.
 
     Returns:
         One fit for each recording, and the drivers that all records together determine. In the
         fits, `shared_cov` is the error that all recordings with one driver share: the error of
-        Z_th, the tolerances of the instrument and `r_load_tolerance`. The rest of `cov` is the own
-        error of each recording.
+        Z_th, and the tolerances of the instrument. The rest of `cov` is the own error of each
+        recording.
 
     Raises:
         ValueError: The study has no loaded recording.
@@ -356,7 +342,6 @@ def identify_jointly(
         bounds=bounds,
         order=order,
         instrument=instrument,
-        r_load_tolerance=r_load_tolerance,
         plausible=plausible,
     )
     drivers = Drivers(study, options)
@@ -410,9 +395,8 @@ def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit]
     driver, loads = groups[0].driver, [group.loads() for group in groups]
     several = tuple(len(group.several()) for group in groups)
     model = _model(options, driver, any(group.shared for group in groups))
-    tolerance = jax.device_put(options.r_load_tolerance)
     together = _TOGETHER[worth_compiling(sum(of.spectrum.x.size for of in loads))]
-    found, better, delays, cov = together(model, loads, several, driver, tolerance)
+    found, better, delays, cov = together(model, loads, several, driver)
     found, delays, cov = jax.device_get((found, delays, cov))
     small = [np.zeros(len(group.rows), bool) for group in groups]
     width = _narrower(loads, found, delays, cov, float(driver.sample_rate))
@@ -421,7 +405,7 @@ def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit]
         start = better if driver.instrument is None else driver
         again = dataclasses.replace(_calibrations(start), delay_width=jax.device_put(width))
         model = dataclasses.replace(model, calibrations=again)
-        others, better, *_ = together(model, loads, several, better, tolerance)
+        others, better, *_ = together(model, loads, several, better)
         others = jax.device_get(others)
         small = [
             _successful(one) & _successful(other) for one, other in zip(found, others, strict=True)

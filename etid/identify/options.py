@@ -70,7 +70,6 @@ class Options:
         order: Number of poles of Z_th.
         driver_drift: As in `identify_driver`.
         instrument: As in `identify_driver`.
-        r_load_tolerance: As in `identify_jointly`.
         plausible: As in `identify_driver`.
     """
 
@@ -81,7 +80,6 @@ class Options:
     order: Order = 5
     driver_drift: float = 0.0
     instrument: Instrument | None = None
-    r_load_tolerance: float = 0.0
     plausible: tuple[float, float] = PLAUSIBLE
 
     @classmethod
@@ -96,7 +94,6 @@ class Options:
         order: Order = 5,
         driver_drift: float = 0.0,
         instrument: Instrument | None = None,
-        r_load_tolerance: float = 0.0,
         plausible: tuple[float, float] = PLAUSIBLE,
     ) -> "Options":
         """The options, from the keywords of a public function.
@@ -123,7 +120,6 @@ class Options:
             order=order_of(order),
             driver_drift=part_of("driver_drift", driver_drift),
             instrument=instrument,
-            r_load_tolerance=part_of("r_load_tolerance", r_load_tolerance),
             plausible=range_of("plausible", plausible),
         )
         if estimator is not None:
@@ -177,7 +173,6 @@ class Options:
             order=0 if self.order == AUTO else self.order,
             start=tuple(self.circuit.values().tolist()),
             candidates=tuple(type(one).__name__ for one in self.circuits if several),
-            r_load_tolerance=self.r_load_tolerance,
             driver_drift=self.driver_drift,
             instrument=tuple(
                 f"{name} {value!r}"

@@ -216,13 +216,7 @@ def _errors(used: Sequence[Description], settings: Settings | None) -> str:
             " The shared part contains errors of the instrument, as parameters with these standard "
             f"deviations: {', '.join(instrument)} (relative; capacitance in farad)."
         )
-    tolerance = settings.r_load_tolerance if settings is not None else 0.0
-    if tolerance > 0:
-        text += (
-            f" The shared part contains a tolerance of {100 * tolerance:.3g} % (standard "
-            "deviation) of the known resistors."
-        )
-    elif not any(one.startswith("r_load") for one in instrument):
+    if not any(one.startswith("r_load") for one in instrument):
         text += (
             " They do not contain the tolerance of the known resistors. This tolerance passes 1:1 "
             "into every resistance and inversely into every capacitance."
@@ -267,14 +261,13 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         "circuit": circuit,
         "Z_th": f"{driver}order {settings.order or 'auto'}, drift of "
         f"{100 * settings.driver_drift:g} %, accepted from {low:g} to {high:g} ohm at 1 kHz",
-        "R_L": f"standard deviation of {100 * settings.r_load_tolerance:g} %",
         "tolerances of the instrument": ", ".join(settings.instrument) or "none",
         "known elements": ", ".join(settings.fixed + settings.prior + settings.bounds) or "none",
         "computed": f"in {settings.precision} on {settings.backend}",
         "versions": ", ".join(settings.versions),
     }
     if found.by_current:
-        del rows["Z_th"], rows["R_L"]
+        del rows["Z_th"]
     shown = tuple(rows.items())
     return Table(("setting", "value"), shown, caption="Settings")
 

@@ -166,9 +166,9 @@ class Fit(Judged, HasSource[Circuit]):
 
     Attributes:
         circuit: Identified elements in SI units.
-        cov: Covariance of the elements in SI units; NaN if the method gives none. It does not
-            contain the tolerance of the calibration resistor, which passes 1:1 into every
-            resistance. The fits of `identify_jointly` contain its `r_load_tolerance`.
+        cov: Covariance of the elements in SI units; NaN if the method gives none. It contains the
+            tolerance of the known resistor, which passes 1:1 into every resistance, only if an
+            `Instrument` states it.
         shared_cov: The part of `cov` that comes from the driver. All fits with this driver share
             it, so the spread between trials does not show it.
         rrse: Root relative squared error of V_out (paper, eq. 3).

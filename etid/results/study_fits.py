@@ -58,8 +58,6 @@ class Settings:
         start: Typical values of the elements [SI]; fits start around them.
         candidates: Names of the circuits from which that of all recordings was chosen; empty if
             the user chose it.
-        r_load_tolerance: Relative standard deviation of the known resistors that is included in
-            the standard errors.
         driver_drift: As in `identify_driver`.
         fixed: Known elements and their values [SI], such as `"r_s 500.0"`.
         prior: Elements with a prior, values and standard deviations [SI], such as
@@ -82,7 +80,6 @@ class Settings:
     order: int
     start: tuple[float, ...]
     candidates: tuple[str, ...]
-    r_load_tolerance: float
     driver_drift: float
     fixed: tuple[str, ...]
     prior: tuple[str, ...]
@@ -233,6 +230,10 @@ def _settings(table: Table) -> Settings | None:
                 remedy=REMEDY,
             )
         values[name] = tuple(items) if several else value
+    if "r_load_tolerance" in table.attributes:  # earlier versions stored this tolerance apart
+        part = table.attribute("r_load_tolerance")
+        if isinstance(part, float) and part > 0:
+            values["instrument"] = (*values.get("instrument", ()), f"r_load {part!r}")
     return Settings(**values)
 
 

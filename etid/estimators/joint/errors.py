@@ -44,8 +44,6 @@ class _AtMinimum(NamedTuple):
         linear: The same, linear in the parameters.
         changes: Derivatives of the terms with respect to changes of the circuit, to a gain of
             V_out, and to a gain of the current if there is one.
-        by_scale: Pull of a measured current that is larger by its own size on the parameters; 0
-            without a current.
     """
 
     chi2: Float[Array, "*load"]
@@ -53,7 +51,6 @@ class _AtMinimum(NamedTuple):
     terms: Float[Array, "*load term"]
     linear: Linear
     changes: Float[Array, "*load change term"]
-    by_scale: Float[Array, "*load parameter"]
 
 
 class _Eliminated(eqx.Module):
@@ -64,16 +61,12 @@ class _Eliminated(eqx.Module):
         cov: Covariance of the own parameters at a given `common`.
         slope: Derivative of the minimum over the own parameters with respect to `common`.
         bread: Inverse of the curvature over the own parameters.
-        pull: Pull of another scale of the current on `common`, the own parameters following.
-        own_pull: Change of the own parameters by it at a given `common`.
     """
 
     rest: Curvature
     cov: Float[Array, "own own"]
     slope: Float[Array, "own common"]
     bread: Float[Array, "own own"]
-    pull: Float[Array, " common"]
-    own_pull: Float[Array, " own"]
 
 
 class _ByX(NamedTuple):
@@ -111,8 +104,6 @@ class Found(NamedTuple):
         scale: Whether they show another scale of the current, or all loads contradict the
             tolerances of the instrument.
         delay: Its trigger delay.
-        by_scale: Derivatives of the logarithms of the elements with respect to that of a scale of
-            all measured currents.
         by_error: Changes of the logarithms of the elements with the prior mean of each error of the
             instrument.
     """
@@ -121,7 +112,6 @@ class Found(NamedTuple):
     other: Bool[Array, "*load"]
     scale: Bool[Array, "*load"]
     delay: Delay
-    by_scale: Float[Array, "*load element"]
     by_error: Float[Array, "*load element error"]
 
 
@@ -143,7 +133,7 @@ def estimates(
         _of_group(model, loads, common, own, several=count > 0)
         for loads, own, count in zip(groups, owns, several, strict=True)
     ]
-    of, pull = model.calibrations, jnp.zeros_like(common)
+    of = model.calibrations
     total = of.linear(of.near(common)).curvature()
     for loads, (eliminated, *_) in zip(groups, found, strict=True):
         used = jax.tree.map(
@@ -151,7 +141,6 @@ def estimates(
             eliminated.rest,
         )
         total = jax.tree.map(jnp.add, total, used)
-        pull = pull + jnp.where(loads.used[:, None], eliminated.pull, 0.0).sum(0)
     bread = inverse(total.expected)
     score = total.score
     for loads, (*_, by_x), count in zip(groups, found, several, strict=True):
@@ -191,9 +180,8 @@ def estimates(
             )
             delay = Delay(own.delay_samples, private[e, e], eliminated.slope[e])
             other, scale = _contradictions(at, load, own, eliminated, bread, total.score)
-            follows = eliminated.slope @ bread
-            moved = eliminated.own_pull + follows @ pull
-            return Found(estimate, other, scale | beyond, delay, moved[:e], of.errors(follows[:e]))
+            by_error = of.errors(eliminated.slope[:e] @ bread)
+            return Found(estimate, other, scale | beyond, delay, by_error)
 
         judged.append(in_turn(one, loads, own, *each, results))
     return cov, judged
@@ -234,14 +222,12 @@ def _at_minimum(
     priors = jnp.eye(q.size, owned, owned - q.size) / lane.gains.widths(q[:owned])[None]
     jacobian = jnp.concatenate([near.jacobian[owned:], near.jacobian[:owned]])
     linear = Linear(jacobian, *weights, priors=priors)
-    rows = condensed.rows(changes(lane, near))
     at = _AtMinimum(
         chi2=2 * profile.objective / (lane.terms - owned),
         rrse=profile.rrse(records, load.spectrum.x),
         terms=condensed.part,
         linear=linear,
-        changes=rows,
-        by_scale=linear.told(rows[-1:])[0] if lane.gains.outputs > 1 else jnp.zeros_like(q),
+        changes=condensed.rows(changes(lane, near)),
     )
     brought = profile.whitened(profile.gains * as_complex(jnp.sqrt(records.variance_x))[None, :])
     brought = brought * as_complex(1 / jnp.sqrt(profile.expected))
@@ -305,8 +291,7 @@ def _eliminated(at: _AtMinimum, c: int) -> _Eliminated:
     bread = inverse(of.expected[c:, c:])
     slope = -bread @ of.expected[c:, :c]
     cov = bread @ of.score[c:, c:] @ bread
-    pull = at.by_scale[:c] + slope.T @ at.by_scale[c:]
-    return _Eliminated(of.eliminate(c), cov, slope, bread, pull, bread @ at.by_scale[c:])
+    return _Eliminated(of.eliminate(c), cov, slope, bread)
 
 
 # --- Loads with one unloaded record --------------------------------------------------------------
