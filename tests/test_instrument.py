@@ -101,6 +101,19 @@ def test_an_error_within_its_tolerance_is_in_the_standard_errors(skin):
     assert np.abs(errors(fit, skin)).max() < 4
 
 
+def test_two_records_of_one_resistor_have_one_error_of_it():
+    """It passes one to one into all elements; those of two resistors would partly cancel."""
+    (first, skin), (second, _) = records(), records(seed=1)
+    both = [first, second.replace(path="again")]
+    variances = []
+    for instrument in (None, etid.Instrument(r_load=1e-2)):
+        driver = etid.identify_driver(both, instrument=instrument)
+        fit = etid.identify_skin(skin, driver)
+        variances.append(np.diagonal(fit.cov) / np.square(fit.circuit.values()))
+    # The record tells a little of the resistor, too: of the variance, less than 2 %.
+    np.testing.assert_allclose(variances[1] - variances[0], 1e-4, rtol=0.02)
+
+
 def test_an_error_far_beyond_its_tolerance_is_inconsistent():
     # A record of dry skin shows a gain to 0.025 %: 0.2 % are eight standard errors.
     assert fitted(*records(gain=-2e-3), etid.Instrument(gain=2e-4)).verdict == "inconsistent"
@@ -250,7 +263,7 @@ def tracked(calibration, skin, instrument=None):
     return fit, found, np.append(variances, (of.charge_stderr / CHARGE) ** 2)
 
 
-@pytest.mark.parametrize("skin", [DRY, DAMP], ids=["dry", "damp"])
+@pytest.mark.parametrize("skin", [DRY, pytest.param(DAMP, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("source", TOLERANCES)
 def test_a_tracker_has_the_errors_of_the_instrument(source, skin):
     size = TOLERANCES[source][1]

@@ -31,7 +31,8 @@ class Calibrations(eqx.Module):
     """The likelihood of the calibrations of a driver.
 
     In all methods `common` is the vector of the `DriverUnknowns`, followed by the errors of the
-    instrument in their standard deviations: gain, crosstalk, capacitance, and each known resistor.
+    instrument in their standard deviations: gain, crosstalk, capacitance, and the known resistor of
+    each calibration, which those of equal value share.
     A gain g, a crosstalk κ and an error θ of the resistor R change the gains to
 
         V_out / V_th = (1 + g) R' / (R' + Z_th) + κ,      R' = R (1 + θ).
@@ -127,10 +128,13 @@ class Calibrations(eqx.Module):
         """Z_th, the gains, and their derivatives with respect to Z_th and to the errors."""
         f = self.spectra.frequency if every is None else every.at(self.spectra.frequency)
         z_th = jax.vmap(self.source_of(common).response)(f)
-        known = resistance = as_complex(self.calibration.r_load)[:, None]
+        r_load = self.calibration.r_load
+        known = resistance = as_complex(r_load)[:, None]
+        # Records with equal values are of one resistor: they have the error of the first of them.
+        first = jnp.argmax(r_load[:, None] == r_load[None], axis=1)
         off = as_complex(self.tolerances * self.errors(common))
         if self.instrument is not None:
-            resistance = known * (1 + off[-known.size :, None])
+            resistance = known * (1 + off[-known.size :][first, None])
         loop, late = reciprocal(resistance + z_th), self.named(common).delay_samples
         gains = jax.vmap(delayed, (0, 0, 0, None))(resistance * loop, f, late, self.rate)
         by_z = -gains * loop
@@ -141,7 +145,7 @@ class Calibrations(eqx.Module):
         turned = gains * (resistance + z_th) * inverse
         of_loads = jnp.stack([gains, turned, jnp.zeros_like(gains)])  # nothing is across a resistor
         of_resistor = -(1 + gain) * by_z * z_th * known * inverse
-        of_each = as_complex(jnp.eye(known.size))[:, :, None] * of_resistor[None]
+        of_each = as_complex(jnp.eye(known.size)[first].T)[:, :, None] * of_resistor[None]
         by_error = jnp.concatenate([of_loads, of_each])
         by_error = by_error * as_complex(self.tolerances)[:, None, None]
         return z_th, (1 + gain) * gains + crosstalk * turned, (1 + gain) * by_z, by_error
