@@ -28,7 +28,7 @@ from etid.estimators.output_error.prediction import (
 from etid.estimators.registry import OUTPUT_ERROR
 from etid.identify.fitting import skin
 from etid.recordings.preflight import Inspected
-from etid.results.driver import SourceImpedance
+from etid.results.driver import ContinuousDriver, SourceImpedance
 from etid.signals.noise import Measurement
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -120,6 +120,7 @@ def fitted():
         samples=3334,
     ).simulate(seed=11)
     driver = etid.identify_driver(study["c"])
+    assert isinstance(driver, ContinuousDriver)
     kept_numbers.check("driver_in_time", kept_numbers.of_driver(driver))
 
     def of(scale, late=driver.calibration.delay_std_samples, **other):

@@ -13,8 +13,8 @@ NOISE = np.where(np.arange(60) < 20, 4.0, 1.0)  # variance beyond what the weigh
 
 
 def linear(noise=NOISE, priors=PRIORS):
-    parts = J, np.ones(60), noise, priors
-    return Linear(*(None if part is None else jnp.asarray(part) for part in parts))
+    weighted = jnp.asarray(J), jnp.ones(60), jnp.asarray(noise)
+    return Linear(*weighted, None if priors is None else jnp.asarray(priors))
 
 
 @pytest.mark.parametrize("priors", [PRIORS, None])
