@@ -28,6 +28,7 @@ DAMP = SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
 GAIN = etid.Instrument(gain=1e-3)
 ALL = etid.Instrument(gain=2e-3, r_load=2e-3, crosstalk=2e-3, capacitance=2e-12)
 DRAWS = 40
+STUDIES = 16  # of ten fits each
 CHARGE = 1e-7  # [C] of the size of a phase
 NORMAL_95 = scipy.stats.norm.ppf(0.975)
 
@@ -324,7 +325,7 @@ def test_intervals_hold_errors_that_are_drawn_from_their_tolerances(skin):
 def test_intervals_of_joint_fits_hold_errors_that_are_drawn_from_their_tolerances():
     loads = {f"{kind}/{i}": skin for kind, skin in (("dry", DRY), ("damp", DAMP)) for i in range(5)}
     inside, refused = {"dry": 0, "damp": 0}, 0
-    for number in range(DRAWS):
+    for number in range(STUDIES):
         draw = np.random.default_rng([number, 5])
         drawn = {name: size * draw.standard_normal() for name, size in ALL.stored().items()}
         drawn["capacitance"] = abs(drawn["capacitance"])
@@ -333,8 +334,8 @@ def test_intervals_of_joint_fits_hold_errors_that_are_drawn_from_their_tolerance
             refused += fit.verdict != "successful"
             kind, _, _ = path.partition("/")
             inside[kind] += int(np.sum(np.abs(errors(fit, loads[path])) < NORMAL_95))
-    assert refused <= 3  # of 400: one of a thousand is refused by chance
-    # The fits of a study share most of their errors: the count is one of 40 in the worst case.
-    low, high = scipy.stats.binom.interval(0.999, DRAWS, 0.95)
+    assert refused <= 3  # of 160: one of a thousand is refused by chance
+    # The fits of a study share most of their errors: the count is one of 16 in the worst case.
+    low, high = scipy.stats.binom.interval(0.999, STUDIES, 0.95)
     assert low <= inside["dry"] / 15 <= high
     assert low <= inside["damp"] / 15 <= high

@@ -13,10 +13,11 @@ yet, so that Y = H V(X/H). Without H, C_p is up to 1 % wrong at 200 kHz, and 15 
 60 dB. The filter is not known. So its logarithm is a sum of those of usual filters H_m, with
 unknown weights that all records share,
 
-    Y_k − H_k V_k(X/H) e^(−jω_k τ),      log H = Σ_m ε_m log H_m,      ε_m ~ N(0, 1).
+    Y_k − H_k V_k(X/H) e^(−jω_k τ),      log H = Σ_m s tanh(ε_m/s) log H_m,      ε_m ~ N(0, 1).
 
 ε = 0 is a converter that changes nothing below half its sample rate. The ε are further z, which
-change no Z_th (`etid.estimators.maximum_likelihood.given_driver`).
+change no Z_th (`etid.estimators.maximum_likelihood.given_driver`). No weight exceeds s: a misfit of
+another cause would raise X/H beyond all bounds.
 
 The weights are constant: a fit gets the variances of the terms from earlier estimates. If they
 followed the parameters, elements with a large gain would explain any residual by the noise of X,
@@ -53,6 +54,7 @@ STILL = 1e-6  # of the pulse rate; stands for 0 Hz, where a series capacitor has
 CURRENT_WIDTH = 5.0
 # Corners of usual anti-alias filters, Butterworth's of fourth order, relative to the sample rate.
 CORNERS = (0.4, 0.3)
+STRONGEST = 1.2  # s, so that either filter alone is possible
 
 
 class Amplitudes(eqx.Module):
@@ -192,7 +194,8 @@ class Amplitudes(eqx.Module):
         """Fourier coefficients of V_out [V] of a record."""
         _, _, z = self.gain(spectrum).split(own)
         logs = _log_filters(spectrum.frequency / self.sample_rate)
-        passed = jnp.exp(as_complex(z[-logs.shape[0] :]) @ logs)
+        strength = STRONGEST * jnp.tanh(z[-logs.shape[0] :] / STRONGEST)
+        passed = jnp.exp(as_complex(strength) @ logs)
         before = eqx.tree_at(lambda s: s.x, spectrum, spectrum.x * reciprocal(passed))
         return self.turned(own, passed * self.loaded(own, before), spectrum)
 
