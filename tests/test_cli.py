@@ -279,7 +279,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
 ):
     def calibrated(records, former):
         driver = etid.identify_driver(records, method="equation_error", throw=False)
-        return CheckedCalibration(driver, records, [1e-3], {})
+        return CheckedCalibration(driver, [1e-3], {})
 
     monkeypatch.setattr(calibrate, "calibrate", calibrated)
     page = (pathlib.Path(__file__).parents[1] / "docs" / "command_line.md").read_text("utf-8")

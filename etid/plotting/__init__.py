@@ -12,7 +12,7 @@ import numpy as np
 from etid.circuits.circuit import AbstractCircuit
 from etid.precision import in_float64
 from etid.recordings.recording import Recording
-from etid.results.data import AnyAxes, MeasuredImpedance, Shown
+from etid.results.data import AnyAxes, MeasuredImpedance, Shown, Size
 from etid.results.driver import Driver, SourceImpedance
 from etid.results.fit import Fit
 from etid.results.fits import Fits
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from etid.plotting.style import Canvas
 
 Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
-Size = tuple[float, float] | None
 
 
 @overload

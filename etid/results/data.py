@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Shown = Literal["pulse", "impedance", "residual"]
 AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
+Size = tuple[float, float] | None  # width and height [inch]
 _Kind = TypeVar("_Kind", bound="HasSource")
 
 
@@ -92,7 +93,7 @@ class HasSource(Generic[Circuit]):
         *,
         show: Shown = "pulse",
         axes: AnyAxes = None,
-        size: tuple[float, float] | None = None,
+        size: Size = None,
         title: str | None = "",
     ) -> np.ndarray:
         """Draw the fit; the same as `etid.plot(fit)`.

@@ -39,8 +39,7 @@ class CheckedCalibration(Overviewed):
 
     Attributes:
         driver: The driver.
-        recordings: Its calibrations.
-        noise: Standard deviation of the noise of V_out in each calibration [V].
+        noise: Standard deviation of the noise of V_out in each of its recordings [V].
         expected: Relative standard errors of the elements, by skin and by what is recorded.
         moved: Largest difference of |Z_th| from that of the former driver [standard errors]; NaN
             without one.
@@ -51,7 +50,6 @@ class CheckedCalibration(Overviewed):
     """
 
     driver: Driver
-    recordings: Sequence[Recording]
     noise: Sequence[float]
     expected: Mapping[str, Mapping[str, Mapping[str, float]]]
     moved: float = float("nan")
@@ -61,7 +59,7 @@ class CheckedCalibration(Overviewed):
     def _overview(self) -> Overview:
         records = [
             (one.path, f"{(one.r_load or 0.0) / 1e3:g} kΩ", f"{1e3 * noise:.2g} mV")
-            for one, noise in zip(self.recordings, self.noise, strict=True)
+            for one, noise in zip(self.driver.recordings, self.noise, strict=True)
         ]
         heads = ("calibration", "resistor", "noise of V_out")
         rows = [
@@ -85,7 +83,7 @@ class CheckedCalibration(Overviewed):
         if self.moved > MOVED and self.r_load is not None:
             lines.append(
                 f"a resistor of {self.r_load / 1e3:.4g} kΩ in place of "
-                f"{(self.recordings[0].r_load or 0.0) / 1e3:.4g} kΩ would explain it"
+                f"{(self.driver.recordings[0].r_load or 0.0) / 1e3:.4g} kΩ would explain it"
             )
         if self.moved > MOVED:
             lines += [
@@ -130,7 +128,7 @@ def calibrate(
         if found is not None:
             errors = _errors(_fitted(imitated(records[0], found, skin, 0), found))
             expected[name][f"also with {r / 1e3:g} kΩ"] = errors
-    known = CheckedCalibration(driver, records, noise, expected)
+    known = CheckedCalibration(driver, noise, expected)
     if former is None:
         return known
     shifts = {name: _shift(now[name], _fitted(trial, former)) for name, trial in trials.items()}
@@ -232,7 +230,7 @@ def _compared(of: CheckedCalibration, former: Driver) -> CheckedCalibration:
     moved = float(np.max(np.abs(z - old) / spread))
     ratio = float(np.average(z - old, weights=1 / spread**2))
     rest = float(np.max(np.abs(z - old - ratio) / spread))
-    r_load = of.recordings[0].r_load or float("nan")
+    r_load = of.driver.recordings[0].r_load or float("nan")
     return dataclasses.replace(
         of,
         moved=moved,

@@ -196,7 +196,7 @@ class Amplitudes(eqx.Module):
         logs = _log_filters(spectrum.frequency / self.sample_rate)
         strength = STRONGEST * jnp.tanh(z[-logs.shape[0] :] / STRONGEST)
         passed = jnp.exp(as_complex(strength) @ logs)
-        before = eqx.tree_at(lambda s: s.x, spectrum, spectrum.x * reciprocal(passed))
+        before = dataclasses.replace(spectrum, x=spectrum.x * reciprocal(passed))
         return self.turned(own, passed * self.loaded(own, before), spectrum)
 
     @property
