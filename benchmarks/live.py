@@ -47,11 +47,15 @@ OPTIONS = (
 
 
 class Timed(LiveView):
-    """A view that notes what each tick took."""
+    """A view that notes what each tick took.
 
-    # Whether a snapshot was due; time by the clock and of the processor for it, and time of the
-    # processor for the tick [s].
-    taken: list[tuple[bool, float, float, float]]
+    Attributes:
+        taken: For each tick whether a snapshot was due, the time by the clock and of the processor
+            for it, and the time of the processor for the tick [s]. The array is whole from the
+            start: it must not look like memory that grows.
+    """
+
+    taken: np.ndarray
     last = 0.0
 
     def show(self, tick: Tick) -> None:
@@ -59,8 +63,8 @@ class Timed(LiveView):
         due, wall, busy = self._due, time.perf_counter(), time.process_time()
         super().show(tick)
         now = time.process_time()
-        taken = (self._due != due, time.perf_counter() - wall, now - busy, busy - self.last)
-        self.taken.append(taken)
+        taken = self._due != due, time.perf_counter() - wall, now - busy, busy - self.last
+        self.taken[tick.number] = taken
         self.last = now
 
 
@@ -70,9 +74,9 @@ def main(arguments: argparse.Namespace) -> bool:
     controller = etid.Controller.of(tracker)
     period = tracker.period / tracker.model.bands.sample_rate
     number = round(60 * arguments.minutes / period)
-    ticks, memory = [], []
+    seconds, memory = np.full(number, np.nan), []
     view = Timed(controller, charge=CHARGE, controls=False)
-    view.taken = []
+    view.taken = np.full((number, 4), np.nan)
     with view:
         print(view.address, flush=True)
         reader = [sys.executable, "-c", READER, view.address]
@@ -81,14 +85,14 @@ def main(arguments: argparse.Namespace) -> bool:
             for tick in follow(
                 paced(tracker, pulses, number), controller, charge=CHARGE, view=view
             ):
-                ticks.append(tick.seconds)
+                seconds[tick.number] = tick.seconds
                 if tick.number in (int(SETTLED * number), number - 1):
                     memory.append((resident(os.getpid()), resident(view._process.pid)))
         finally:
             for reader in readers:
                 reader.kill()
                 reader.wait()
-    seconds, (shown, wall, busy, working) = np.array(ticks), np.array(view.taken).T
+    shown, wall, busy, working = view.taken.T
     shown = shown > 0
     grown = np.diff(np.array(memory) / 1e6, axis=0)[0]
 
@@ -97,7 +101,7 @@ def main(arguments: argparse.Namespace) -> bool:
         return int(((tick < period) & (tick + handed >= period))[1:].sum())
 
     numbers = {
-        "ticks": len(ticks),
+        "ticks": number,
         "snapshots": int(shown.sum()),
         "median of the tick / pulse period": np.median(seconds) / period,
         "median of the tick / pulse period, by the processor's time": np.median(working) / period,
