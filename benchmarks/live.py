@@ -27,7 +27,7 @@ from etid.online.stream import Block
 TARGETS = {
     "ticks that are late because of the page, by the processor's time": at_most(0),
     "p99 of the hand-over / pulse period, by the processor's time": at_most(0.2),
-    "growth of the loop's memory [MB]": at_most(20),
+    "growth of the loop's memory [MB]": at_most(5),
     "growth of the page's memory [MB]": at_most(5),
 }
 SETTLED = 0.2  # of the time, after which memory should not grow

@@ -83,10 +83,13 @@ def test_the_standard_errors_of_changes_are_what_the_changes_scatter_by():
     assert 0.64 < np.sqrt(np.mean(np.square(off))) < 1.36
 
 
-def test_a_threshold_is_exceeded_as_rarely_as_it_says():
-    for freedom, count in ((1, 3), (4, 16)):
-        rare = scipy.stats.chi2.sf(changes.threshold(freedom, count), freedom)
-        np.testing.assert_allclose(rare, FALSE_ALARMS / count, rtol=1e-6)
+@pytest.mark.parametrize(("freedom", "count"), [(1, 1), (1, 3), (4, 16), (9, 40)])
+def test_a_square_is_unlikely_as_rarely_as_it_says(freedom, count):
+    limit = scipy.stats.chi2.isf(FALSE_ALARMS / count, freedom)
+    squares = np.array([0.0, 0.999 * limit, 1.001 * limit, np.inf, np.nan])
+    is_unlikely = changes.unlikely(squares, freedom, count)
+    np.testing.assert_array_equal(is_unlikely, [False, False, True, True, False])
+    assert not changes.unlikely(squares[:1], freedom, count).any()
 
 
 def test_a_step_and_a_single_period_are_seen_as_well_as_a_line():

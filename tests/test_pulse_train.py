@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import scipy.fft
 
 import etid
 from etid.identify.planning import explained
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
-from etid.signals.pulse_train import find_pulses
+from etid.signals.pulse_train import fast_length, find_pulses
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -92,6 +93,11 @@ def test_other_signals_have_no_pulses_to_compare():
         assert train.spacing is None
         assert train.mismatch == ""
         assert train.counted == PULSE
+
+
+def test_transforms_have_the_lengths_that_scipy_recommends():
+    for least in (1, 7, 1667, 10_007, 65_537, 2_100_001):
+        assert fast_length(least) == scipy.fft.next_fast_len(least, real=True)
 
 
 def test_check_and_import_compare_the_rates(tmp_path):

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import etid
 from etid.estimators.lanes import Harmonics
-from etid.estimators.score_tests.unloaded import UnloadedShape, shape
+from etid.estimators.score_tests import FALSE_ALARMS
+from etid.estimators.score_tests.unloaded import SEEN, UnloadedShape, shape
 from etid.recordings.preflight import Inspected
 from etid.recordings.study import Study
 from etid.simulation.scenes import Scene, Trial
@@ -95,6 +97,11 @@ def test_a_pulse_of_a_tenth_shows_what_has_changed_as_well(part):
 @pytest.fixture(scope="module")
 def driver():
     return etid.identify_driver(study()["calibration/0"])
+
+
+def test_the_limit_is_exceeded_as_rarely_as_a_study_can_bear():
+    directions = of_calibration(spectrum(study()["calibration/0"])).directions.shape[0]
+    np.testing.assert_allclose(scipy.stats.chi2.sf(SEEN, directions), FALSE_ALARMS, rtol=1e-2)
 
 
 @pytest.mark.parametrize(

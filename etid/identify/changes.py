@@ -27,7 +27,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
@@ -52,6 +51,7 @@ EXPLAINED = (
 LANES = 64  # circuits of one call
 RIDGE = 1e-10  # added to the diagonal, for elements without effect
 LARGEST = 20.0  # limit on the change of a logarithm; an undetermined change can be arbitrary
+USUAL = 12.0  # χ² that exceeds its mean by no more is never unlikely
 DRIVER = 2e-3  # allowed change of a driver, expressed as a change of the calibration resistor
 
 
@@ -107,10 +107,13 @@ def courses(periods: int) -> Float[np.ndarray, "course period"]:
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-@functools.lru_cache(maxsize=64)
-def threshold(freedom: int, count: int) -> float:
-    """Threshold that the largest of `count` χ² exceeds with the probability `FALSE_ALARMS`."""
-    return float(scipy.special.chdtri(freedom, FALSE_ALARMS / count))
+def unlikely(square: Float[np.ndarray, "..."], freedom: int, count: int) -> Bool[np.ndarray, "..."]:
+    """Whether χ² is so large that the largest of `count` exceeds it by chance in `FALSE_ALARMS`."""
+    if not np.any(square > freedom + USUAL):
+        return np.zeros(square.shape, bool)
+    import scipy.special  # takes a fifth of a second, which few recordings need
+
+    return scipy.special.chdtrc(freedom, square) < FALSE_ALARMS / count
 
 
 def found(
@@ -158,8 +161,8 @@ def _changes(of: Repeats, slopes: np.ndarray, allowed: np.ndarray) -> Change:
     # Half of the false alarms are allowed to elements that change alone: a test of four elements
     # together would hide such a change.
     alone = (fitted.alone / noise[..., None]).max((1, 2))
-    seen = (fitted.square / noise).max(1) > threshold(tested, 2 * len(course))
-    seen |= alone > threshold(1, 2 * len(course) * tested)
+    seen = unlikely((fitted.square / noise).max(1), tested, 2 * len(course))
+    seen |= unlikely(alone, 1, 2 * len(course) * tested)
     cov = np.broadcast_to(fitted.cov, (*noise.shape, tested, tested)) * noise[..., None, None]
     # Without aliases the courses do not mix: the course that fits best is the most likely one.
     likely = np.argmax(_solved(whole[:, None], plain, tested).square, axis=1)
@@ -257,7 +260,8 @@ def _uneven(of: Repeats, course: Float[np.ndarray, "course period"]) -> np.ndarr
     along = np.abs(of.unloaded @ course.T)
     worst = np.argmax(along, axis=1)
     largest = along[np.arange(len(worst)), worst]
-    seen = largest**2 > threshold(1, len(course)) * of.unloaded_variance
+    with np.errstate(divide="ignore", invalid="ignore"):  # a record without noise
+        seen = unlikely(largest**2 / of.unloaded_variance, 1, len(course))
     return np.where(seen, largest * np.ptp(course, axis=1)[worst], 0.0)
 
 

@@ -27,11 +27,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Complex, Float, Int
 
 from etid.recordings.preflight import Inspected
-from etid.signals.pulse_train import RATE
+from etid.signals.pulse_train import RATE, fast_length
 
 # Relative to the sample rate. Below it, bands share one estimate of their noise. Above it, aliases
 # can exceed the noise; each band then has its own.
@@ -100,7 +99,7 @@ def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
     The measured pulse rate may differ from the nominal one.
     """
     length = int((1 - RATE) * sample_rate / pulse_rate)
-    size = scipy.fft.next_fast_len(length, real=True)
+    size = fast_length(length)
     count = int(band * size)
     edges, ratio = [*range(min(12, count))], 1.08
     while edges and edges[-1] * ratio + 1 < count:
@@ -352,7 +351,7 @@ def _transforms(
             period[:] = v[start : start + layout.length]
     used -= used.mean((1, 2), keepdims=True)
     # In single precision, this is four times as fast as the transform of NumPy.
-    transform = np.asarray(scipy.fft.rfft(cut))
+    transform = np.fft.rfft(cut)
     return transform[:, :, 1 : layout.polynomials.shape[1] + 1]
 
 

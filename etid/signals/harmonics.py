@@ -34,7 +34,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.signals.transfer import power
@@ -118,8 +117,7 @@ def harmonics(
     parts = math.gcd(periods, samples)
     xp, v = namespace(v), v[..., :samples]
     folded = v.reshape(*v.shape[:-1], parts, -1).sum(-2) / samples
-    # SciPy transforms several records side by side; one transform takes as long as with NumPy.
-    transform = np.asarray(scipy.fft.rfft(folded)) if xp is np else jnp.fft.rfft(folded)
+    transform = xp.fft.rfft(folded)
     basis, fit = _drift(periods, samples)
     # The transform is linear: the drift needs only the transforms of the powers of time.
     drift = xp.einsum("dp,...p->...d", fit, _sums(v, periods))

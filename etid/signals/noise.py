@@ -35,7 +35,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
-import scipy
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.signals.harmonics import DRIFT_DEGREE, WINDOW, harmonics, namespace
@@ -305,7 +304,7 @@ def corner(
     bins, white = _bins(periods, samples)
     late = int(np.argmax(np.abs(v[: samples // periods])))
     means = v[: samples // periods * periods].reshape(periods, -1).mean(1)
-    transform = np.asarray(scipy.fft.rfft(v))[bins] - _drifts(periods, samples) @ means
+    transform = np.fft.rfft(v)[bins] - _drifts(periods, samples) @ means
     smooth = transform * (bins**2 * np.exp(2j * np.pi * bins * late / samples))
     bend = smooth[:-2] - 2 * smooth[1:-1] + smooth[2:]
     ratio = (np.square(np.real(bend)) + np.square(np.imag(bend))) / (white * samples * sigma**2)

@@ -6,11 +6,11 @@ the elements. This module uses NumPy only, because it runs before anything is fi
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Bool, Complex, Float, Int
 
 EVEN = 0.05  # relative range of the spacings up to which the pulses have one rate
@@ -269,16 +269,22 @@ def _lags(
     begin = first - reach
     start = max(0, begin)
     searched = rises(records[rows, 1, start : last + reach], rise)
-    size = scipy.fft.next_fast_len(template.shape[1] + 2 * reach, real=True)
-    # Single precision suffices, and its transforms take a fourth of the time.
-    both = np.zeros((len(rows), 2, size), np.float32)
+    size = fast_length(template.shape[1] + 2 * reach)
+    both = np.zeros((len(rows), 2, size))
     both[:, 0, start - begin : start - begin + searched.shape[1]] = searched
     both[:, 1, : template.shape[1]] = template
-    transforms = np.asarray(scipy.fft.rfft(both))
-    products = scipy.fft.irfft(transforms[:, 0] * np.conj(transforms[:, 1]), size)
-    correlation = np.asarray(products)[:, : 2 * reach + 1]
+    transforms = np.fft.rfft(both)
+    products = np.fft.irfft(transforms[:, 0] * np.conj(transforms[:, 1]), size)
+    correlation = products[:, : 2 * reach + 1]
     lag = highest(correlation) - reach
     return np.where(correlation.max(1) > -correlation.min(1), lag, np.inf)
+
+
+@functools.cache
+def fast_length(least: int) -> int:
+    """The smallest length 2^i 3^j 5^k that is not below `least`: its Fourier transform is fast."""
+    odd = (3**j * 5**k for j in range(15) for k in range(10))
+    return min(of << (-(-least // of) - 1).bit_length() for of in odd)
 
 
 def whole_lag(lag: float) -> int:

@@ -18,11 +18,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.profile import excess
-from etid.estimators.score_tests import FALSE_ALARMS
 from etid.results.driver import Driver, HarmonicDriver
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, power, turns
@@ -30,7 +28,7 @@ from etid.signals.transfer import as_complex, power, turns
 DEGREE = 6  # polynomials of δ; its real part has no constant, because that is the amplitude
 FIRST = 6  # first harmonics, which are not used because of hum and drift
 SIGNAL = 0.9  # smallest share of signal in the power around a harmonic that is used
-SEEN = float(scipy.special.chdtri(2 * DEGREE - 1, FALSE_ALARMS))  # χ² of all directions
+SEEN = 37.37  # χ² that all directions exceed by chance in `FALSE_ALARMS`
 SIZE = 1.5e-4  # smallest difference relative to V_th; pulses repeat no better than this
 # Additional difference for a driver with a known drift, relative to the drift. It is three times
 # the standard deviation of an inductance, which has the largest effect.
