@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
 from etid.circuits.impedance import realise
@@ -57,6 +58,24 @@ def test_source_impedance_is_its_formula():
     np.testing.assert_allclose(respond(SOURCE, FREQUENCY), expected, rtol=1e-12)
     np.testing.assert_allclose(transfer_of(SOURCE.state_space()), expected, rtol=SOLVED)
     assert SOURCE.order == 5
+
+
+def test_slopes_are_the_derivatives_of_the_formula():
+    def parts(vector, frequency):
+        z = unravel(vector).response(frequency)
+        return jnp.stack([z.real, z.imag])
+
+    vector, unravel = ravel_pytree(SOURCE)
+    z, slopes = SOURCE.with_slopes(FREQUENCY)
+    np.testing.assert_allclose(z, respond(SOURCE, FREQUENCY), rtol=1e-12)
+    expected = jnp.moveaxis(jax.jacfwd(parts)(vector, FREQUENCY), -1, 0)
+    size = jnp.abs(expected).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(
+        jnp.stack([slopes.real, slopes.imag], axis=1) / size, expected / size, atol=1e-12
+    )
+    _, by_log_f = jax.jvp(lambda f: parts(vector, f), (FREQUENCY,), (FREQUENCY,))
+    found = -slopes[SOURCE.log_omegas].sum(axis=0)
+    np.testing.assert_allclose(jnp.stack([found.real, found.imag]), by_log_f, rtol=1e-9, atol=1e-6)
 
 
 def one_section(log_zeta):

@@ -84,12 +84,15 @@ class Prior(eqx.Module):
         active = jnp.minimum(self._source(parameters).response(self.frequency).real, 0.0)
         return jnp.concatenate([(parameters - self.centre) / self.width, active / self.unit])
 
-    def slopes(self, parameters: Float[Array, " parameter"]) -> Float[Array, "parameter term"]:
-        """Derivatives of the residuals."""
-        source = self._source(parameters)
-        active = source.response(self.frequency).real < 0
-        by_resistance = jnp.where(active[None, :], source.slopes(self.frequency).real, 0.0)
-        return jnp.concatenate([jnp.diag(1 / self.width), by_resistance / self.unit], axis=1)
+    def with_slopes(
+        self, parameters: Float[Array, " parameter"]
+    ) -> tuple[Float[Array, " term"], Float[Array, "parameter term"]]:
+        """The residuals and their derivatives."""
+        z_th, slopes = self._source(parameters).with_slopes(self.frequency)
+        active = jnp.where(z_th.real < 0, 1 / self.unit, 0.0)
+        terms = [(parameters - self.centre) / self.width, z_th.real * active]
+        rows = [jnp.diag(1 / self.width), slopes.real * active[None, :]]
+        return jnp.concatenate(terms), jnp.concatenate(rows, axis=1)
 
     def _source(self, parameters: Float[Array, " parameter"]) -> SourceImpedance:
         return ravel_pytree(self.structure)[1](parameters)

@@ -284,10 +284,8 @@ class ContinuousDriver(Driver):
 
         var = J cov Jᵀ,    J = ∂(ln |Z_th|, arg Z_th) / ∂parameters
         """
-        relative = (
-            self.source.slopes(jnp.asarray(frequency))
-            * reciprocal(self.response(frequency))[None, :]
-        )
+        z_th, slopes = self.source.with_slopes(jnp.asarray(frequency))
+        relative = slopes * reciprocal(z_th)[None, :]
         parts = jnp.stack([relative.real, relative.imag])
         return jnp.sqrt(jnp.einsum("cif,ij,cjf->cf", parts, self.cov, parts))
 

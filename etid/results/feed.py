@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits.impedance import realise
 from etid.circuits.overview import Overview
@@ -108,10 +108,10 @@ class SourceImpedance(eqx.Module):
         return jax.lax.complex(real, imaginary)
 
     @jax.jit  # JAX remembers its trace
-    def slopes(
+    def with_slopes(
         self, frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, "parameter frequency"]:
-        """Derivatives of the impedance [Ω] with respect to the parameters, in field order."""
+    ) -> tuple[Complex[Array, " frequency"], Complex[Array, "parameter frequency"]]:
+        """`response`, and its derivatives with respect to the parameters, in field order."""
         omega = 2 * jnp.pi * frequency[None, :]
         gain, slope, gain_real = (
             as_complex(of)[:, None] for of in (self.gain, self.slope, self.gain_real)
@@ -128,18 +128,25 @@ class SourceImpedance(eqx.Module):
         scale = 1 / (1 + turn * turn)
         shape_real = jax.lax.complex(scale, -turn * scale)
         constant = as_complex(jnp.full((1, frequency.size), jnp.exp(self.log_resistance)))
-        by_omega_real = jax.lax.complex(jnp.zeros_like(turn), turn) * shape_real * shape_real
-        return jnp.concatenate(
-            [
-                constant,
-                (section * (damping + 2 * x) - slope) * x * shape,
-                -section * damping * x * shape,
-                shape,
-                x * shape,
-                gain_real * by_omega_real,
-                shape_real,
-            ]
-        )
+        single = gain_real * shape_real
+        by_omega_real = jax.lax.complex(jnp.zeros_like(turn), turn) * shape_real
+        slopes = [
+            constant,
+            (section * (damping + 2 * x) - slope) * x * shape,
+            -section * damping * x * shape,
+            shape,
+            x * shape,
+            single * by_omega_real,
+            shape_real,
+        ]
+        parts = jnp.concatenate([constant, section, single])
+        return jnp.sum(parts, axis=0), jnp.concatenate(slopes)
+
+    @property
+    def log_omegas(self) -> Int[np.ndarray, " pole"]:
+        """Places of all ln ω among the parameters; Z_th depends on f/ω only."""
+        pairs, reals = self.log_omega.shape[0], self.log_omega_real.shape[0]
+        return np.r_[1 : 1 + pairs, 1 + 4 * pairs : 1 + 4 * pairs + reals]
 
     def state_space(self) -> StateSpace:
         """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""

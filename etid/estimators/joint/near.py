@@ -104,26 +104,26 @@ class _Signals(eqx.Module):
             found.append(jnp.concatenate([w, constant, *([known] if of_x else [])], axis=-2))
         return found
 
-    def _loaded(
-        self, common: Float[Array, " common"], frequency: Float[Array, " knot"]
-    ) -> Complex[Array, " knot"]:
-        resistance = as_complex(self.calibrations.calibration.r_load.mean())
-        return self.calibrations.source_of(common).response(frequency) + resistance
+    @property
+    def _resistance(self) -> Complex[Array, ""]:
+        return as_complex(self.calibrations.calibration.r_load.mean())
 
     def __call__(self, common: Float[Array, " common"]) -> list[Float[Array, "signal knot"]]:
         """The signals of each part."""
         known = self.calibrations.gains(common, self.calibrations.knots)
-        of_w = [jnp.log(self._loaded(common, f))[None] for f in self.frequency]
+        z_th = self.calibrations.source_of(common).response
+        of_w = [jnp.log(z_th(f) + self._resistance)[None] for f in self.frequency]
         faults = self.calibrations.errors(common)[:FAULTS]
         return self._of_each(_parts(known), list(map(_parts, of_w)), faults)
 
     def slopes(self, common: Float[Array, " common"]) -> list[Float[Array, "common signal knot"]]:
         """Derivatives of the signals."""
-        source = self.calibrations.source_of(common)
+        source, resistance = self.calibrations.source_of(common), self._resistance
         known = self.calibrations.slopes(common, self.calibrations.knots).by_unknown
         of_w = []
         for f in self.frequency:
-            rows = source.slopes(f) * reciprocal(self._loaded(common, f))[None, :]
+            z_th, rows = source.with_slopes(f)
+            rows = rows * reciprocal(z_th + resistance)[None, :]
             of_w.append(jnp.pad(rows, ((0, common.size - rows.shape[0]), (0, 0)))[:, None])
         faults = self.calibrations.errors(jnp.eye(common.size))[:, :FAULTS]
         return self._of_each(_parts(known), list(map(_parts, of_w)), faults)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
-from etid.estimators.estimate import DELAY_WIDTH, Prior, prior
+from etid.estimators.estimate import DELAY_WIDTH, prior
 from etid.estimators.maximum_likelihood.condensed import Condensed, Near, Slopes, apart, means
 from etid.estimators.maximum_likelihood.profile import Profile, Records, excess, total
 from etid.estimators.sandwich import Linear
@@ -120,14 +120,20 @@ class Calibrations(eqx.Module):
         self, common: Float[Array, " common"], every: Knots | None = None
     ) -> Complex[Array, "record frequency"]:
         """Gains R e^(−jωτ) / (R + Z_th) with the known resistors, at all harmonics or at knots."""
-        return self._gains(common, every)[1]
+        f = self._frequency(every)
+        return self._gains(common, f, jax.vmap(self.source_of(common).response)(f))[0]
+
+    def _frequency(self, every: Knots | None) -> Float[Array, "record frequency"]:
+        of = self.spectra.frequency
+        return of if every is None else every.at(of)
 
     def _gains(
-        self, common: Float[Array, " common"], every: Knots | None
+        self,
+        common: Float[Array, " common"],
+        f: Float[Array, "record frequency"],
+        z_th: Complex[Array, "record frequency"],
     ) -> tuple[Complex[Array, "... frequency"], ...]:
-        """Z_th, the gains, and their derivatives with respect to Z_th and to the errors."""
-        f = self.spectra.frequency if every is None else every.at(self.spectra.frequency)
-        z_th = jax.vmap(self.source_of(common).response)(f)
+        """The gains, and their derivatives with respect to Z_th and to the errors."""
         r_load = self.calibration.r_load
         known = resistance = as_complex(r_load)[:, None]
         # Records with equal values are of one resistor: they have the error of the first of them.
@@ -139,7 +145,7 @@ class Calibrations(eqx.Module):
         gains = jax.vmap(delayed, (0, 0, 0, None))(resistance * loop, f, late, self.rate)
         by_z = -gains * loop
         if self.instrument is None:
-            return z_th, gains, by_z, gains[None][:0]
+            return gains, by_z, gains[None][:0]
         gain, crosstalk, *_ = off
         inverse = reciprocal(resistance)
         turned = gains * (resistance + z_th) * inverse
@@ -148,13 +154,13 @@ class Calibrations(eqx.Module):
         of_each = as_complex(jnp.eye(known.size)[first].T)[:, :, None] * of_resistor[None]
         by_error = jnp.concatenate([of_loads, of_each])
         by_error = by_error * as_complex(self.tolerances)[:, None, None]
-        return z_th, (1 + gain) * gains + crosstalk * turned, (1 + gain) * by_z, by_error
+        return (1 + gain) * gains + crosstalk * turned, (1 + gain) * by_z, by_error
 
     def slopes(self, common: Float[Array, " common"], every: Knots | None = None) -> Slopes:
         """The gains and their derivatives, at all harmonics or at knots."""
-        f = self.spectra.frequency if every is None else every.at(self.spectra.frequency)
-        z_th, gains, by_z, by_error = self._gains(common, every)
-        by_source = jnp.moveaxis(jax.vmap(self.source_of(common).slopes)(f), 0, 1)
+        f = self._frequency(every)
+        z_th, by_source = jax.vmap(self.source_of(common).with_slopes, out_axes=(0, 1))(f)
+        gains, by_z, by_error = self._gains(common, f, z_th)
         by_delay = -gains * frequency_variable(f / self.rate)
         alone = as_complex(jnp.eye(f.shape[0]))[:, :, None]
         rows = [by_source * by_z[None], alone * by_delay[None], by_error]
@@ -200,13 +206,11 @@ class Calibrations(eqx.Module):
         of = self.named(common)
         late = jnp.eye(of.delay_samples.size) / self.delay_width
         errors = self.errors(common)
-        terms = [self._prior()(of.source), of.delay_samples / self.delay_width, errors]
-        rows = self._prior().slopes(of.source), late, jnp.eye(errors.size)
-        rows = jax.scipy.linalg.block_diag(*rows)
+        regular = prior(self.source, self.rate, self.calibration.r_load.mean())
+        weak, by_source = regular.with_slopes(of.source)
+        terms = [weak, of.delay_samples / self.delay_width, errors]
+        rows = jax.scipy.linalg.block_diag(by_source, late, jnp.eye(errors.size))
         return jnp.concatenate(terms), rows
-
-    def _prior(self) -> Prior:
-        return prior(self.source, self.rate, self.calibration.r_load.mean())
 
     def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
         """Increase of the Σ r² of the calibrations over its value at their own minimum.

@@ -34,9 +34,10 @@ from etid.solvers.matrices import inverse
 
 def _equations_of_terms(_: Any, q: Float[Array, " common"], model: Calibrations) -> NormalEquations:
     """Normal equations with the derivatives of the terms themselves, which contain their noise."""
+    slopes, unit = apart(model.slopes, q), jnp.array([[1.0], [1.0j]])
+    gains, by_common = slopes.gains, slopes.by_unknown
 
-    def of_gains(q: Float[Array, " common"]) -> tuple[Array, Array]:
-        gains, unit = model.gains(q), jnp.array([[1.0], [1.0j]])
+    def of_gains(_) -> tuple[Array, Array]:
         ways = as_complex(jnp.eye(gains.shape[0]))[:, None, :, None] * unit[None, :, None]
 
         def along(way: Complex[Array, "record 1"]) -> Float[Array, "record part"]:
@@ -45,8 +46,7 @@ def _equations_of_terms(_: Any, q: Float[Array, " common"], model: Calibrations)
         return model.terms(gains), jax.vmap(jax.vmap(along))(ways)
 
     # A term depends on the gains at its own harmonic only.
-    terms, by_gain = apart(of_gains, q)
-    by_common, rows = apart(lambda q: model.slopes(q).by_unknown, q), []
+    (terms, by_gain), rows = apart(of_gains, q), []
     by_gain = by_gain.reshape(*by_gain.shape[:2], -1, by_common.shape[-1])
     for slope, (real, imaginary) in zip(jnp.moveaxis(by_common, 1, 0), by_gain, strict=True):
         rows.append(slope.real[:, None] * real[None] + slope.imag[:, None] * imaginary[None])

@@ -235,9 +235,9 @@ def around(
     """A driver around the common parameters c, with z along `directions`; like `given`."""
     resistance = calibrations.calibration.r_load.mean()
     source, gains = calibrations.source_of(c), None
-    loaded = source.response(frequency) + as_complex(resistance)
-    _, by_frequency = jax.jvp(source.response, (frequency,), (frequency,))
-    by_source = source.slopes(frequency) * reciprocal(loaded)[None, :]
+    z_th, by_source = source.with_slopes(frequency)
+    loaded = z_th + as_complex(resistance)
+    by_source = by_source * reciprocal(loaded)[None, :]
     known = None
     if shared:
         of = calibrations.slopes(c)
@@ -250,7 +250,7 @@ def around(
     return GivenDriver(
         frequency=frequency,
         loaded=loaded,
-        w_slope=by_frequency * reciprocal(loaded),
+        w_slope=-jnp.sum(by_source[source.log_omegas], axis=0),
         slope=combined(directions[: by_source.shape[0]].T, by_source),
         resistance=resistance,
         mean=mean,

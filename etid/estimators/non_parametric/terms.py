@@ -195,6 +195,6 @@ class Model(eqx.Module):
     ) -> Float[Array, "parameter term"]:
         """Changes of e by one standard deviation of the drift of each parameter of Z_th."""
         at = self.equation(q, records)
-        slopes = driver.source.slopes(records[-1].frequency)
+        _, slopes = driver.source.with_slopes(records[-1].frequency)
         changed = slopes * as_complex(jnp.asarray(driver.drift_std()))[:, None]
         return real_parts(changed * (at.y * as_complex(at.weight))[None, :])
