@@ -89,8 +89,8 @@ def log_slopes(
         def z(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
             return circuit.with_log_values(logs).impedance()(s)
 
-        by_element = jax.vmap(lambda way: jax.jvp(z, (logs,), (way,))[1])(jnp.eye(logs.size))
-        load = z(logs)
+        along = jax.vmap(lambda way: jax.jvp(z, (logs,), (way,)), out_axes=(None, 0))
+        load, by_element = along(jnp.eye(logs.size))
         return by_element * (driver.sensitivity(load, frequency) * reciprocal(load))[None, :]
 
     return jax.vmap(of)(circuits)

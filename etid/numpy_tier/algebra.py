@@ -108,7 +108,8 @@ def lu(of: Any) -> list[Any]:
         return [of.copy(), np.zeros((*batch, min(rows, columns)), np.int32), order]
     if of.ndim > 2:
         return each(lu, of)
-    found, pivots, _ = get_lapack_funcs("getrf", [of])(of)
+    (factors,) = get_lapack_funcs(("getrf",), (of,))
+    found, pivots, _ = factors(of)
     order = np.arange(of.shape[0], dtype=np.int32)
     for row, other in enumerate(pivots):
         order[[row, other]] = order[[other, row]]

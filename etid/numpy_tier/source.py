@@ -4,12 +4,14 @@ The text consists of functions, of which each statement is a call.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 Function = Callable[..., Sequence[Any]]  # a `Body`, once it is compiled
+LARGE = 1000  # numbers; smaller arrays may stay until the function ends
 
 
 class UntranslatableError(Exception):
@@ -60,9 +62,10 @@ class Body:
         """The text, and the names that it takes from outside.
 
         It is written from its end. A statement without a result that is used later is left out. A
-        variable is deleted after its last use, so that its array can go.
+        large array is deleted after its last use.
         """
-        own = _names(self.arguments).union(*(_names(one.results) for one in self.statements))
+        made = [*self.arguments, *(of for one in self.statements for of in one.results)]
+        own, large = _names(made), _names(of for of in made if math.prod(of.shape) >= LARGE)
         needed = _names(self.results)
         backwards = [f" return [{_listed(self.results)}]"]
         for statement in reversed(self.statements):
@@ -71,7 +74,7 @@ class Body:
             inner = [body.lines() for body in statement.bodies]
             uses = {statement.function} | _names(statement.operands)
             uses = uses.union(*(outside for _, outside in inner))
-            last = sorted((uses - needed) & own)
+            last = sorted((uses - needed) & large)
             backwards += [f" del {','.join(last)}"] if last else []
             operands = _listed([*statement.bodies, *statement.operands])
             results = _listed(statement.results) + "," * statement.several
@@ -83,7 +86,7 @@ class Body:
         return backwards[::-1], needed - own
 
 
-def _names(values: Sequence[Value]) -> set[str]:
+def _names(values: Iterable[Value]) -> set[str]:
     return {of.name for of in values}
 
 

@@ -5,12 +5,13 @@ are inlined, constants folded, equal statements merged, and what does not change
 loops. Loops and branches are calls too: of a Python loop that calls functions of the text.
 """
 
+import functools
 import itertools
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -31,6 +32,14 @@ from etid.numpy_tier.source import (
 )
 
 Equation = Any  # a `JaxprEqn`, whose values are arrays
+broadcast_shapes = functools.cache(np.broadcast_shapes)
+
+
+class Aval(NamedTuple):
+    """Shape and type of an array."""
+
+    shape: tuple[int, ...]
+    dtype: Any
 
 
 def translated(program: ClosedJaxpr) -> Callable[[Sequence[Any]], list[Any]]:
@@ -130,7 +139,7 @@ class Translator:
             return of
         only = operator.itemgetter((0,) * len(of.shape))  # a scalar, not an array without axes
         act = operator.methodcaller("reshape", shape) if shape else only
-        return self.call(("reshape", shape), act, [of], [ShapeDtypeStruct(shape, of.dtype)])[0]
+        return self.call(("reshape", shape), act, [of], [Aval(shape, of.dtype)])[0]
 
     def full(self, of: Value, shape: Sequence[int]) -> Value:
         """The value as an array with all its elements."""
@@ -138,7 +147,7 @@ class Translator:
         if math.prod(of.shape) == math.prod(shape):
             return self.reshaped(of, shape)
         act = partial(filled, shape=shape, dtype=of.dtype)
-        return self.call(("full", shape), act, [of], [ShapeDtypeStruct(shape, of.dtype)])[0]
+        return self.call(("full", shape), act, [of], [Aval(shape, of.dtype)])[0]
 
     def all_full(self, values: Iterable[Value], avals: Iterable[Any]) -> list[Value]:
         """`full` for several values."""
@@ -175,8 +184,8 @@ class Translator:
             return self.implementation(equation, operands)
         avals = [var.aval for var in equation.outvars]
         if name in ELEMENTWISE:
-            shape = np.broadcast_shapes(*[of.shape for of in operands])
-            avals = [ShapeDtypeStruct(shape, aval.dtype) for aval in avals]
+            shape = broadcast_shapes(*[of.shape for of in operands])
+            avals = [Aval(shape, aval.dtype) for aval in avals]
         else:
             operands = self.all_full(operands, (var.aval for var in equation.invars))
         function = RULES[name](params, operands, avals)
