@@ -11,7 +11,7 @@ import pytest
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.circuits.elements import resistor
-from etid.estimators.estimate import DELAY_WIDTH, KNOWN_DELAY, delay_std
+from etid.estimators.estimate import DELAY_WIDTH, KNOWN_DELAY, SOLVER, delay_std
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.output_error.fit import fit_source
 from etid.estimators.output_error.information import (
@@ -191,7 +191,7 @@ def test_errors_of_a_driver_that_misses_its_calibration_are_as_large_as_it_does(
     def fit(sigma):
         m = Measurement(v_th[None], v_out[None], sigma[None], sigma[None], jnp.array([RATE]))
         records = jax.vmap(prepare)(m)
-        _, estimate, _ = fit_source(records, jnp.array([98.8e3]), start)
+        _, estimate, _ = fit_source(records, jnp.array([98.8e3]), start, jnp.asarray(SOLVER.ftol))
         return estimate.chi2, estimate.cov
 
     (chi2, cov), (larger, same) = fit(jnp.asarray(0.01)), fit(jnp.asarray(0.005))

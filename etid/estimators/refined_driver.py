@@ -26,6 +26,7 @@ from etid.signals.transfer import Rational
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
+ROUGHLY = 1e-5  # reduction of Σ r² in a step, below which a start of output error ends
 UNWANTED = 1e3  # added to the cost of a start that did not converge; larger than any cost
 # Two sections closer than `SPLIT` in ln ω and ln ζ are one section, split by noise. Their gains
 # grow with opposite signs along a curved valley, so the curvature at one point is not informative.
@@ -58,7 +59,7 @@ def from_harmonics(
     # One start after the other. In parallel all would run as long as the slowest, and be slower.
     found = jax.lax.map(fit, starts)
     passive = jax.vmap(_is_passive, (0, 0, None))(found.source, found.cov, rate)
-    ranked = jnp.argsort(_cost(found.source, found.cost, passive))
+    ranked = jnp.argsort(jax.vmap(_cost)(found.source, found.cost, passive))
     candidates = jax.tree.map(lambda leaf: leaf[ranked], found)
     calibrations, estimate, near, linear = maximum_likelihood.fit_source(
         spectra, r_load, rate, candidates
@@ -92,22 +93,36 @@ def from_samples(
     baseline = iteration.driver_filter(m.v_th, m.v_out, r_load, order).filter
     records = jax.vmap(prediction.prepare)(m)
     starts = source_starts(baseline.den, order, rate, r_load.mean())
-    found = jax.lax.map(lambda start: output_error.fit_source(records, r_load, start), starts)
-    sources, estimates, _ = found
-    passive = jax.vmap(_is_passive, (0, 0, None))(sources, estimates.cov, rate)
-    # Starts that converged to a passive circuit come first. Among them log s + chi2 decides. With a
-    # noisy record, a spurious resonance can lower chi2 alone; but it raises s.
-    log_s = jnp.log(estimates.rrse**2 / estimates.chi2)
-    settled = estimates.result == optx.RESULTS.successful
-    cost = estimates.chi2 + log_s + jnp.where(settled, 0.0, UNWANTED)
-    chosen = jnp.argmin(_cost(sources, cost, passive))
-    source, estimate, calibration = jax.tree.map(lambda leaf: leaf[chosen], found)
+    count = starts.log_resistance.size
+
+    def fitted(best: tuple[SourceImpedance, Array], number: Array) -> tuple[Any, Any]:
+        last = number == count
+        start = jax.tree.map(
+            lambda all, one: jnp.where(last, one, all[number % count]), starts, best[0]
+        )
+        ftol = jnp.where(last, output_error.SOLVER.ftol, ROUGHLY)
+        source, estimate, calibration = output_error.fit_source(records, r_load, start, ftol)
+        passive = _is_passive(source, estimate.cov, rate)
+        # Starts that converged to a passive circuit come first. Among them log s + chi2 decides.
+        # With a noisy record, a spurious resonance can lower chi2 alone; but it raises s.
+        log_s = jnp.log(estimate.rrse**2 / estimate.chi2)
+        settled = estimate.result == optx.RESULTS.successful
+        cost = estimate.chi2 + log_s + jnp.where(settled, 0.0, UNWANTED)
+        new = source, _cost(source, cost, passive)
+        better = new[1] < best[1]
+        best = jax.tree.map(lambda one, other: jnp.where(better, one, other), new, best)
+        return best, (source, estimate, calibration, passive)
+
+    # All starts roughly, and then the best of them well: one loop holds the only copy of the fit.
+    nothing = jax.tree.map(lambda leaf: leaf[0], starts), jnp.array(jnp.inf)
+    _, found = jax.lax.scan(fitted, nothing, jnp.arange(count + 1))
+    source, estimate, calibration, passive = jax.tree.map(lambda leaf: leaf[-1], found)
     terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
     return ContinuousDriver(
         **_fields(baseline, estimate, rate),
         source=source,
         calibration=calibration,
-        result=first_verdict(*_faults(estimate, calibration, passive[chosen], terms)),
+        result=first_verdict(*_faults(estimate, calibration, passive, terms)),
         method=method,
     )
 
@@ -138,11 +153,11 @@ def _is_passive(
 
 
 def _cost(
-    sources: SourceImpedance, cost: Float[Array, " start"], passive: Bool[Array, " start"]
-) -> Float[Array, " start"]:
+    source: SourceImpedance, cost: Float[Array, ""], passive: Bool[Array, ""]
+) -> Float[Array, ""]:
     """The cost by which starts compete; passive circuits come first."""
     cost = cost + jnp.where(passive, 0.0, UNWANTED)
-    cost = cost + jnp.where(jax.vmap(is_split)(sources), BLURRED, 0.0)
+    cost = cost + jnp.where(is_split(source), BLURRED, 0.0)
     return jnp.where(jnp.isfinite(cost), cost, jnp.inf)
 
 

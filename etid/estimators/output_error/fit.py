@@ -67,10 +67,11 @@ def fit_source(
     records: Records,
     r_load: Float[Array, " record"],
     start: SourceImpedance,
+    ftol: Float[Array, ""],
 ) -> tuple[SourceImpedance, Estimate, Calibration]:
     """Identify Z_th from one or several records with known resistors, stacked.
 
-    The structure of `start` is the order.
+    The structure of `start` is the order, and `ftol` is that of the solver.
 
     Returns:
         Z_th; the estimate, with parameters in the order of the flattened `start`; and the data of
@@ -100,7 +101,8 @@ def fit_source(
         late = nuisance.delay_samples / DELAY_WIDTH
         return jnp.concatenate([parts.reshape(-1), regularise(parameters), late])
 
-    solution = least_squares(residual, SOLVER, q0, (records, r_load, regularise), MAX_STEPS)
+    solver = dataclasses.replace(SOLVER, ftol=ftol)
+    solution = least_squares(residual, solver, q0, (records, r_load, regularise), MAX_STEPS)
     parameters, vectors = named(solution.value)
     nuisance, source = Nuisance.of(vectors), unflatten(parameters)
     weak = jax.jacfwd(regularise)(parameters)
