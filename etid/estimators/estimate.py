@@ -117,29 +117,20 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     it. Otherwise the loaded driver would oscillate with some skins. Each frequency with Re Z_th < 0
     adds the residual Re Z_th / (10⁻³ R_L).
     """
-    half = 0.5 * jnp.pi * sample_rate
-    wide = 10 * r_load
     pairs, reals = start.log_omega.shape[0], start.log_omega_real.shape[0]
-    first = jnp.zeros(pairs).at[:1].set(1.0)
-    centre = SourceImpedance(
-        log_resistance=jnp.log(0.01 * r_load),
-        log_omega=jnp.log(half) + (1 - first) * math.log(3.0),
-        log_zeta=first * math.log(0.7) + (1 - first) * math.log(1.5),
-        gain=jnp.zeros(pairs),
-        slope=jnp.zeros(pairs),
-        log_omega_real=jnp.full(reals, jnp.log(half)).at[0].add(-math.log(500.0)),
-        gain_real=jnp.zeros(reals),
-    )
-    width = SourceImpedance(
-        log_resistance=jnp.array(3.0),
-        log_omega=1.5 + 1.5 * first,
-        log_zeta=0.5 + first,
-        gain=jnp.full(pairs, wide),
-        slope=jnp.full(pairs, wide),
-        log_omega_real=jnp.full(reals, 3.0),
-        gain_real=jnp.full(reals, wide),
-    )
-    centre, width = ravel_pytree(centre)[0], ravel_pytree(width)[0]
+    first, slow = np.arange(pairs) == 0, np.arange(reals) == 0
+    by_ln3, by_damping = np.where(first, 0.0, math.log(3.0)), np.where(first, 0.7, 1.5)
+    # In the order of the fields, in units of R_L and of half the Nyquist frequency.
+    none, no_real = np.zeros(pairs), np.zeros(reals)
+    centre = [[math.log(0.01)], by_ln3, np.log(by_damping), none, none]
+    centre += [np.where(slow, -math.log(500.0), 0.0), no_real]
+    width = [[3.0], np.where(first, 3.0, 1.5), np.where(first, 1.5, 0.5), none + 10, none + 10]
+    width += [no_real + 3, no_real + 10]
+    field = np.repeat(np.arange(7), [len(of) for of in centre])
+    log_half = jnp.log(0.5 * jnp.pi * sample_rate)
+    unit = jnp.where(np.isin(field, (1, 5)), log_half, jnp.where(field == 0, jnp.log(r_load), 0.0))
+    centre = np.concatenate(centre) + unit
+    width = np.concatenate(width) * jnp.where(np.isin(field, (3, 4, 6)), r_load, 1.0)
     frequency = jnp.asarray(PASSIVE_BAND) * sample_rate
     return Prior(start, centre, width, frequency, 1e-3 * r_load)
 

@@ -1,0 +1,52 @@
+"""Results of benchmarks name commits of this history; those older than the code are skipped."""
+
+import csv
+import pathlib
+import subprocess
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[1]
+MADE_BY = {  # tables whose names are not those of their benchmarks
+    "failures": "failure_map",
+    "silent_failures": "failure_map",
+    "selection_map": "selection",
+}
+# No number of a benchmark depends on them.
+SHOWN = ("cli.py", "commands", "files", "live", "paper", "plotting", "report")
+
+
+def git(*arguments):
+    return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _whole_history():
+    if git("rev-parse", "--is-shallow-repository").stdout.strip() != "false":
+        pytest.skip("the history of the project is not here")
+
+
+def commits(table):
+    with table.open(newline="") as file:
+        return {row["commit"].rstrip("+") for row in csv.DictReader(file)}
+
+
+TABLES = sorted((ROOT / "benchmarks" / "results").glob("*.csv"))
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.stem)
+def test_a_result_is_of_this_code(table):
+    """A stale one is skipped, with what to run: a whole benchmark takes longer than all tests."""
+    unknown = [
+        one for one in commits(table) if git("cat-file", "-e", f"{one}^{{commit}}").returncode
+    ]
+    assert not unknown, f"{table.name} names commits that do not exist: {unknown}"
+    of = ["etid", *(f":!etid/{name}" for name in SHOWN)]
+    changed = {
+        name
+        for one in commits(table)
+        for name in git("diff", "--name-only", one, "HEAD", "--", *of).stdout.split()
+    }
+    if changed:
+        command = MADE_BY.get(table.stem, table.stem)
+        pytest.skip(f"{len(changed)} modules changed since: python -m benchmarks {command}")
