@@ -101,7 +101,7 @@ def main(arguments: argparse.Namespace) -> bool:
         return int(((tick < period) & (tick + handed >= period))[1:].sum())
 
     numbers = {
-        "ticks": number,
+        "ticks": int(np.isfinite(seconds).sum()),
         "snapshots": int(shown.sum()),
         "median of the tick / pulse period": np.median(seconds) / period,
         "median of the tick / pulse period, by the processor's time": np.median(working) / period,

@@ -1,13 +1,8 @@
 """No search for garbage while many objects are made that live on: imports and traces."""
 
-import atexit
 import contextlib
 import gc
 from collections.abc import Iterator
-
-# When a process ends, all its memory goes; to search it for garbage first takes a quarter of a
-# second.
-atexit.register(gc.freeze)
 
 
 @contextlib.contextmanager

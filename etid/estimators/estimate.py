@@ -89,9 +89,11 @@ class Prior(eqx.Module):
     ) -> tuple[Float[Array, " term"], Float[Array, "parameter term"]]:
         """The residuals and their derivatives."""
         z_th, slopes = self._source(parameters).with_slopes(self.frequency)
-        active = jnp.where(z_th.real < 0, 1 / self.unit, 0.0)
-        terms = [(parameters - self.centre) / self.width, z_th.real * active]
-        rows = [jnp.diag(1 / self.width), slopes.real * active[None, :]]
+        active = z_th.real < 0
+        terms = [(parameters - self.centre) / self.width]
+        terms += [jnp.where(active, z_th.real, 0.0) / self.unit]
+        by_resistance = jnp.where(active[None, :], slopes.real, 0.0)
+        rows = [jnp.diag(1 / self.width), by_resistance / self.unit]
         return jnp.concatenate(terms), jnp.concatenate(rows, axis=1)
 
     def _source(self, parameters: Float[Array, " parameter"]) -> SourceImpedance:
@@ -119,18 +121,19 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     """
     pairs, reals = start.log_omega.shape[0], start.log_omega_real.shape[0]
     first, slow = np.arange(pairs) == 0, np.arange(reals) == 0
-    by_ln3, by_damping = np.where(first, 0.0, math.log(3.0)), np.where(first, 0.7, 1.5)
     # In the order of the fields, in units of R_L and of half the Nyquist frequency.
-    none, no_real = np.zeros(pairs), np.zeros(reals)
-    centre = [[math.log(0.01)], by_ln3, np.log(by_damping), none, none]
-    centre += [np.where(slow, -math.log(500.0), 0.0), no_real]
-    width = [[3.0], np.where(first, 3.0, 1.5), np.where(first, 1.5, 0.5), none + 10, none + 10]
-    width += [no_real + 3, no_real + 10]
+    omega, zeta = np.where(first, 1.0, 3.0), np.where(first, 0.7, 1.5)
+    omega_real = np.where(slow, 1 / 500, 1.0)
+    section, real = np.zeros(pairs), np.zeros(reals)
+    centre = [[math.log(0.01)], np.log(omega), np.log(zeta), section, section]
+    centre += [np.log(omega_real), real]
+    width = [[3.0], np.where(first, 3.0, 1.5), np.where(first, 1.5, 0.5)]
+    width += [section + 10, section + 10, real + 3, real + 10]
     field = np.repeat(np.arange(7), [len(of) for of in centre])
     log_half = jnp.log(0.5 * jnp.pi * sample_rate)
     unit = jnp.where(np.isin(field, (1, 5)), log_half, jnp.where(field == 0, jnp.log(r_load), 0.0))
-    centre = np.concatenate(centre) + unit
-    width = np.concatenate(width) * jnp.where(np.isin(field, (3, 4, 6)), r_load, 1.0)
+    centre = jnp.asarray(np.concatenate(centre)) + unit
+    width = jnp.asarray(np.concatenate(width)) * jnp.where(np.isin(field, (3, 4, 6)), r_load, 1.0)
     frequency = jnp.asarray(PASSIVE_BAND) * sample_rate
     return Prior(start, centre, width, frequency, 1e-3 * r_load)
 

@@ -80,10 +80,12 @@ def triangular_solve(
     if lower:
         a, b = a[..., ::-1, ::-1], b[..., ::-1, :]
     a = np.triu(a)
-    try:
+    good = np.isfinite(a).all((-2, -1)) & (a.diagonal(axis1=-2, axis2=-1) != 0).all(-1)
+    if good.all():
         found = np.linalg.solve(a, b)
-    except np.linalg.LinAlgError:
+    else:  # Gauss would refuse a singular matrix, and spread what is not finite
         found = substituted(a, b)
+        found[good] = np.linalg.solve(a[good], b[good])
     found = found[..., ::-1, :] if lower else found
     return found if left_side else found.swapaxes(-1, -2)
 
@@ -92,28 +94,32 @@ def substituted(a: Any, b: Any) -> Any:
     """X of A X = B for an upper A, which may be singular."""
     found = np.zeros_like(b)
     for row in reversed(range(a.shape[-1])):
-        rest = b[..., row, :] - np.einsum("...k,...km->...m", a[..., row, :], found)
-        found[..., row, :] = rest / a[..., row, row, None]
+        above = a[..., row, None, row + 1 :] @ found[..., row + 1 :, :]
+        found[..., row, :] = (b[..., row, :] - above[..., 0, :]) / a[..., row, row, None]
     return found
 
 
 def lu(of: Any) -> list[Any]:
     """Both factors in one matrix, the exchanged rows, and their order."""
-    # It takes a fifth of a second, and only a few programs need it.
-    from scipy.linalg.lapack import get_lapack_funcs
-
     if not of.size:  # LAPACK would write a complaint to the terminal
         *batch, rows, columns = of.shape
         order = np.broadcast_to(np.arange(rows, dtype=np.int32), (*batch, rows))
         return [of.copy(), np.zeros((*batch, min(rows, columns)), np.int32), order]
     if of.ndim > 2:
         return each(lu, of)
-    (factors,) = get_lapack_funcs(("getrf",), (of,))
-    found, pivots, _ = factors(of)
+    found, pivots, _ = _factors(of.dtype.char)(of)
     order = np.arange(of.shape[0], dtype=np.int32)
     for row, other in enumerate(pivots):
         order[[row, other]] = order[[other, row]]
     return [found, pivots.astype(np.int32), order]
+
+
+@functools.cache
+def _factors(kind: str) -> Callable[..., Any]:
+    """LAPACK's function for the letter of a type."""
+    from scipy.linalg import lapack  # takes a fifth of a second, and only a few programs need it
+
+    return getattr(lapack, f"{dict(zip('fdFD', 'sdcz', strict=True))[kind]}getrf")
 
 
 def or_nan(function: Callable[..., Any], of: Any) -> Any:

@@ -283,7 +283,7 @@ def _lags(
 @functools.cache
 def fast_length(least: int) -> int:
     """The smallest length 2^i 3^j 5^k that is not below `least`: its Fourier transform is fast."""
-    odd = (3**j * 5**k for j in range(15) for k in range(10))
+    odd = (3**j * 5**k for j in range(30) for k in range(20))
     return min(of << (-(-least // of) - 1).bit_length() for of in odd)
 
 

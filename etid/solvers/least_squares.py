@@ -57,16 +57,18 @@ def least_squares(
 
     Args:
         terms: r(q, args); a function that holds no arrays.
-        solver: Its equations are those of these terms.
+        solver: Its equations are those of these terms; `ftol` may be an array.
         start: First q.
         args: Arrays of the problem.
         max_steps: Largest number of trial steps.
     """
 
-    def search(start: Array, args: Any) -> tuple[Array, Any]:
-        return stepped(terms, solver, start, args, max_steps)
+    def search(start: Array, of: Any) -> tuple[Array, Any]:
+        args, ftol = of
+        return stepped(terms, dataclasses.replace(solver, ftol=ftol), start, args, max_steps)
 
-    value, (steps, result, equations) = minimum(terms, search, start, args)
+    of = args, jnp.asarray(solver.ftol)
+    value, (steps, result, equations) = minimum(lambda q, of: terms(q, of[0]), search, start, of)
     stats = {"num_steps": steps, "normal_equations": equations}
     return optx.Solution(value=value, result=result, aux=None, stats=stats, state=None)
 
