@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.results.driver import SourceImpedance
 from etid.results.fit import Support
@@ -81,20 +81,22 @@ class Prior(eqx.Module):
 
     def __call__(self, parameters: Float[Array, " parameter"]) -> Float[Array, " term"]:
         """The residuals."""
-        active = jnp.minimum(self._source(parameters).response(self.frequency).real, 0.0)
-        return jnp.concatenate([(parameters - self.centre) / self.width, active / self.unit])
+        return self._terms(parameters, self._source(parameters).response(self.frequency))
 
     def with_slopes(
         self, parameters: Float[Array, " parameter"]
     ) -> tuple[Float[Array, " term"], Float[Array, "parameter term"]]:
         """The residuals and their derivatives."""
         z_th, slopes = self._source(parameters).with_slopes(self.frequency)
-        active = z_th.real < 0
-        terms = [(parameters - self.centre) / self.width]
-        terms += [jnp.where(active, z_th.real, 0.0) / self.unit]
-        by_resistance = jnp.where(active[None, :], slopes.real, 0.0)
+        by_resistance = jnp.where(z_th.real[None, :] < 0, slopes.real, 0.0)
         rows = [jnp.diag(1 / self.width), by_resistance / self.unit]
-        return jnp.concatenate(terms), jnp.concatenate(rows, axis=1)
+        return self._terms(parameters, z_th), jnp.concatenate(rows, axis=1)
+
+    def _terms(
+        self, parameters: Float[Array, " parameter"], z_th: Complex[Array, " frequency"]
+    ) -> Float[Array, " term"]:
+        active = jnp.minimum(z_th.real, 0.0)
+        return jnp.concatenate([(parameters - self.centre) / self.width, active / self.unit])
 
     def _source(self, parameters: Float[Array, " parameter"]) -> SourceImpedance:
         return ravel_pytree(self.structure)[1](parameters)
@@ -119,21 +121,29 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     it. Otherwise the loaded driver would oscillate with some skins. Each frequency with Re Z_th < 0
     adds the residual Re Z_th / (10⁻³ R_L).
     """
+    half = 0.5 * jnp.pi * sample_rate
+    wide = 10 * r_load
     pairs, reals = start.log_omega.shape[0], start.log_omega_real.shape[0]
-    first, slow = np.arange(pairs) == 0, np.arange(reals) == 0
-    # In the order of the fields, in units of R_L and of half the Nyquist frequency.
-    omega, zeta = np.where(first, 1.0, 3.0), np.where(first, 0.7, 1.5)
-    omega_real = np.where(slow, 1 / 500, 1.0)
-    section, real = np.zeros(pairs), np.zeros(reals)
-    centre = [[math.log(0.01)], np.log(omega), np.log(zeta), section, section]
-    centre += [np.log(omega_real), real]
-    width = [[3.0], np.where(first, 3.0, 1.5), np.where(first, 1.5, 0.5)]
-    width += [section + 10, section + 10, real + 3, real + 10]
-    field = np.repeat(np.arange(7), [len(of) for of in centre])
-    log_half = jnp.log(0.5 * jnp.pi * sample_rate)
-    unit = jnp.where(np.isin(field, (1, 5)), log_half, jnp.where(field == 0, jnp.log(r_load), 0.0))
-    centre = jnp.asarray(np.concatenate(centre)) + unit
-    width = jnp.asarray(np.concatenate(width)) * jnp.where(np.isin(field, (3, 4, 6)), r_load, 1.0)
+    first = jnp.zeros(pairs).at[:1].set(1.0)
+    centre = SourceImpedance(
+        log_resistance=jnp.log(0.01 * r_load),
+        log_omega=jnp.log(half) + (1 - first) * math.log(3.0),
+        log_zeta=first * math.log(0.7) + (1 - first) * math.log(1.5),
+        gain=jnp.zeros(pairs),
+        slope=jnp.zeros(pairs),
+        log_omega_real=jnp.full(reals, jnp.log(half)).at[0].add(-math.log(500.0)),
+        gain_real=jnp.zeros(reals),
+    )
+    width = SourceImpedance(
+        log_resistance=jnp.array(3.0),
+        log_omega=1.5 + 1.5 * first,
+        log_zeta=0.5 + first,
+        gain=jnp.full(pairs, wide),
+        slope=jnp.full(pairs, wide),
+        log_omega_real=jnp.full(reals, 3.0),
+        gain_real=jnp.full(reals, wide),
+    )
+    centre, width = ravel_pytree(centre)[0], ravel_pytree(width)[0]
     frequency = jnp.asarray(PASSIVE_BAND) * sample_rate
     return Prior(start, centre, width, frequency, 1e-3 * r_load)
 

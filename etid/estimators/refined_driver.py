@@ -9,7 +9,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from etid.estimators.estimate import Estimate
+from etid.estimators.estimate import SOLVER, Estimate
 from etid.estimators.judgement import MAX_STEPS_REACHED, misses, remarks, too_late
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import driver as maximum_likelihood
@@ -98,9 +98,9 @@ def from_samples(
     def fitted(best: tuple[SourceImpedance, Array], number: Array) -> tuple[Any, Any]:
         last = number == count
         start = jax.tree.map(
-            lambda all, one: jnp.where(last, one, all[number % count]), starts, best[0]
+            lambda every, one: jnp.where(last, one, every[number % count]), starts, best[0]
         )
-        ftol = jnp.where(last, output_error.SOLVER.ftol, ROUGHLY)
+        ftol = jnp.where(last, SOLVER.ftol, ROUGHLY)
         source, estimate, calibration = output_error.fit_source(records, r_load, start, ftol)
         passive = _is_passive(source, estimate.cov, rate)
         # Starts that converged to a passive circuit come first. Among them log s + chi2 decides.
