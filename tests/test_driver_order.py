@@ -1,5 +1,7 @@
 """`order="auto"`: the least order of a driver that its calibrations support."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,10 @@ import pytest
 import etid
 from benchmarks import driver_order as benchmark
 from benchmarks.ladder import CALIBRATION, rung
+from etid.estimators import refined_driver
 from etid.estimators.starts import source_starts
+from etid.identify import driver as identify
+from etid.numpy_tier.tiers import program
 from etid.results.driver import LARGEST, LEAST, ContinuousDriver
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 
@@ -121,3 +126,23 @@ def test_a_driver_of_two_poles_has_starts():
     number = jnp.asarray
     starts = source_starts(number([1.0, -1.5, 0.6]), 2, number(200e3), number(98.8e3))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(starts))
+
+
+@pytest.mark.parametrize("method", ["maximum_likelihood", "output_error"])
+def test_a_driver_tells_the_start_that_led_to_it(monkeypatch, method):
+    """With the starts in reverse order, the same one has its number from the other end."""
+    samples = 3_300 if method == "output_error" else 10_000
+    calibration = rung("dry", snr_db=60.0, samples=samples).simulate(seed=5)[CALIBRATION]
+    counts = []
+
+    def reversed_starts(*of):
+        starts = source_starts(*of)
+        counts.append(starts.log_resistance.size)
+        return jax.tree.map(lambda leaf: leaf[::-1], starts)
+
+    told = etid.identify_driver(calibration, order=3, method=method, throw=False)
+    monkeypatch.setattr(refined_driver, "source_starts", reversed_starts)
+    monkeypatch.setattr(identify, "_identified", program(inspect.unwrap(identify._identified)))
+    turned = etid.identify_driver(calibration, order=3, method=method, throw=False)
+    assert turned.start == counts[0] - 1 - told.start
+    assert float(turned.chi2) == pytest.approx(float(told.chi2), rel=1e-6)  # the same minimum

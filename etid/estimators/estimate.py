@@ -36,6 +36,7 @@ class Estimate(eqx.Module):
         rrse: Root relative squared error of V_out; the largest of all records.
         result: Verdict of the solver.
         steps: Trial steps of the solver.
+        start: Number of the start that led here, from 0 on; only fits of drivers tell it.
         shared_cov: Part of `cov` that comes from the driver; all skins identified with this driver
             share it.
         strain: Increase of the Σ r² of the calibrations in a joint fit; 0 for other fits.
@@ -55,6 +56,7 @@ class Estimate(eqx.Module):
     result: optx.RESULTS
     steps: Int[Array, ""]
     shared_cov: Float[Array, "parameter parameter"]
+    start: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), int))
     strain: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     hum: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     falls: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))

@@ -64,6 +64,7 @@ def from_harmonics(
     calibrations, estimate, near, linear = maximum_likelihood.fit_source(
         spectra, r_load, rate, candidates
     )
+    estimate = dataclasses.replace(estimate, start=ranked[estimate.start])
     source, calibration = calibrations.source, calibrations.calibration
     statistic = jnp.nanmax(of_calibrations.missing_pole(calibrations, near, linear))
     if r_load.size > 1:
@@ -95,7 +96,7 @@ def from_samples(
     starts = source_starts(baseline.den, order, rate, r_load.mean())
     count = starts.log_resistance.size
 
-    def fitted(best: tuple[SourceImpedance, Array], number: Array) -> tuple[Any, Any]:
+    def fitted(best: tuple[SourceImpedance, Array, Array], number: Array) -> tuple[Any, Any]:
         last = number == count
         start = jax.tree.map(
             lambda every, one: jnp.where(last, one, every[number % count]), starts, best[0]
@@ -108,13 +109,14 @@ def from_samples(
         log_s = jnp.log(estimate.rrse**2 / estimate.chi2)
         settled = estimate.result == optx.RESULTS.successful
         cost = estimate.chi2 + log_s + jnp.where(settled, 0.0, UNWANTED)
-        new = source, _cost(source, cost, passive)
-        better = new[1] < best[1]
+        estimate = dataclasses.replace(estimate, start=best[1])
+        new = source, number, _cost(source, cost, passive)
+        better = new[2] < best[2]
         best = jax.tree.map(lambda one, other: jnp.where(better, one, other), new, best)
         return best, (source, estimate, calibration, passive)
 
     # All starts roughly, and then the best of them well: one loop holds the only copy of the fit.
-    nothing = jax.tree.map(lambda leaf: leaf[0], starts), jnp.array(jnp.inf)
+    nothing = jax.tree.map(lambda leaf: leaf[0], starts), jnp.array(0), jnp.array(jnp.inf)
     _, found = jax.lax.scan(fitted, nothing, jnp.arange(count + 1))
     source, estimate, calibration, passive = jax.tree.map(lambda leaf: leaf[-1], found)
     terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
@@ -137,6 +139,7 @@ def _fields(baseline: Rational, estimate: Estimate, rate: Float[Array, ""]) -> d
         "rrse": estimate.rrse,
         "chi2": estimate.chi2,
         "steps": estimate.steps,
+        "start": estimate.start,
         "remarks": remarks(estimate.hum),
     }
 

@@ -147,10 +147,10 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     if np.isfinite(size) and not options.plausible[0] <= size <= options.plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
     if LOG.isEnabledFor(logging.INFO):
-        tried = f"; {driver.tried}" if isinstance(driver, ContinuousDriver) else ""
-        LOG.info(
-            "%s: %s", seen[0].recording.path, f"{driver._overview().title}{tried}".rstrip("; ")
-        )
+        said = [driver._overview().title]
+        if isinstance(driver, ContinuousDriver):
+            said += [f"start {int(driver.start)} won", *filter(None, [str(driver.tried)])]
+        LOG.info("%s: %s", seen[0].recording.path, "; ".join(said))
     if throw and driver.verdict != "successful":
         found = f"{driver.verdict}, |Z_th| is {size:.3g} ohm at 1 kHz"
         raise IdentificationError(f"driver: {found}. {message(driver.verdict)}", driver)

@@ -240,6 +240,8 @@ class ContinuousDriver(Driver):
             contain it.
         instrument: Tolerances of the instrument; None if it has none. `cov` does not contain them.
         tried: Orders that `order="auto"` tried; none if the user chose the order.
+        start: Which start of Z_th led here, from 0 on: three generic ones, and one with the
+            resonance that Steiglitz-McBride found.
     """
 
     _: dataclasses.KW_ONLY
@@ -249,6 +251,7 @@ class ContinuousDriver(Driver):
     drift: Float[Array | np.ndarray, ""] | None = None
     instrument: Instrument | None = None
     tried: OrderEvidence = eqx.field(default_factory=OrderEvidence.none)
+    start: Int[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: np.array(0))
 
     def drift_std(self) -> Float[Array, " parameter"]:
         """Standard deviations of the parameters of `source` that come from `drift` alone."""

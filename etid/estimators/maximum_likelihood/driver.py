@@ -157,12 +157,13 @@ def rough_source(
 
 
 class _Tried(eqx.Module):
-    """How many fits with all harmonics were tried, and the result of the first that converged.
+    """How many fits with all harmonics were tried, and the first of them that converged.
 
     If none has converged, the result is that of the best start.
     """
 
     count: Int[Array, ""]
+    start: Int[Array, ""]
     common: Float[Array, " common"]
     squares: Float[Array, ""]
     steps: Int[Array, ""]
@@ -193,6 +194,7 @@ def fit_source(
         q, least = minimum(model, q)
         new = _Tried(
             count=tried.count + 1,
+            start=tried.count,
             common=q,
             squares=2 * least.objective,
             steps=start.steps + least.points,
@@ -202,10 +204,8 @@ def fit_source(
         old = dataclasses.replace(tried, count=new.count)
         return jax.tree.map(lambda one, other: jnp.where(kept, one, other), new, old)
 
-    nothing = jnp.zeros(())
-    tried = _Tried(
-        jnp.array(0), model.start(), nothing, jnp.zeros_like(best.steps), jnp.array(False)
-    )
+    none = jnp.zeros_like(best.steps)
+    tried = _Tried(none, none, model.start(), jnp.zeros(()), none, jnp.array(False))
     tried = jax.lax.while_loop(
         lambda tried: ~tried.settled & (tried.count < candidates.cost.size), fit, tried
     )
@@ -231,6 +231,7 @@ def fit_source(
             tried.settled, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
         ),
         steps=tried.steps,
+        start=tried.start,
         hum=jnp.stack([profile.shows_hum(records) for records, profile in each]).any(),
     )
     calibration = dataclasses.replace(calibration, delay_samples=found.delay_samples)
