@@ -1,9 +1,10 @@
 """Every estimator, ours and the rivals, on a ladder of scenes: error against time, and the front.
 
 An error is that of the elements over their Cramer-Rao bounds, the median over draws with a
-calibration of their own; a time is that of one skin from its samples, the driver known, compilation
-apart, on one core. Before everything else rivals have their own environments
-(`python -m benchmarks rivals`); one that has none is in the table with the reason.
+calibration of their own and its 95 % interval; a time is that of one skin from its samples, the
+driver known, compilation apart, on one core. The default has all draws, other methods as many as a
+budget allows. Rivals have their own environments (`python -m benchmarks rivals`); one that has none
+is in the table with the reason.
 """
 
 import argparse
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.stats
 from tqdm import tqdm
 
 import etid
@@ -20,19 +22,21 @@ from benchmarks import rivals
 from benchmarks.estimators import DEFAULT, ELEMENTS, NOTHING, OURS, Answer, Drivers, method_of
 from benchmarks.ladder import CALIBRATION, SOURCES, START, TRIAL, ladder
 from benchmarks.machine import make_room, timed, write_csv
+from benchmarks.rates import LEVEL
 from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report, show
 from benchmarks.speed_accuracy_chart import chart
 from etid.simulation.scenes import Scene
 
 PINNED = True
 FILE = "speed_accuracy.csv"
-BUDGET = 6.0  # [s] for one estimator in one scene
+BUDGET = 60.0  # [s] for the draws of one method other than the default in one scene
+TIMED = 6.0  # [s] for a timed batch, and for a rival in one scene
 BATCH = 32  # recordings of a timed batch
 PATIENCE = 30  # budgets that a rival may take for all it has begun
-FEWEST = 4  # draws, however long they take
+FEWEST, OF_RIVALS = 4, 24  # draws, however long they take; at most
 PRINTED = (
-    *("scene", "estimator", "mode", "draws", "error", "none", "said", "wrong", "silent", "ms"),
-    *("first_s", "driver_ms", "on_front", "missing"),
+    *("scene", "estimator", "mode", "draws", "error", "error_low", "error_high"),
+    *("none", "said", "wrong", "silent", "ms", "first_s", "driver_ms", "on_front", "missing"),
 )
 SHOWN = ("dry, 80 dB", "dry, 60 dB", "dry, 30 dB", "damp, 60 dB", "damp, 40 dB", "dry, 1 MHz")
 FEW, FEW_REPETITIONS = ("dry, 60 dB", "damp, 40 dB"), 5
@@ -49,7 +53,7 @@ OPTIONS = (
     FOLDER,
     option("--scene", action="append", choices=list(ladder()), help="repeatable"),
     option("--source", default="simulated", choices=SOURCES),
-    option("--repetitions", default=24),
+    option("--repetitions", default=200),
 )
 
 
@@ -98,12 +102,14 @@ class Result(NamedTuple):
 
     def row(self) -> dict[str, Any]:
         """Medians of the errors, and parts of the draws, as a table has them."""
-        answered = np.isfinite(self.each)
+        answered, low, high = np.isfinite(self.each), *median_interval(self.each)
         good = np.array([of.successful for of in self.answers])
         with np.errstate(invalid="ignore"):
             medians = np.median(self._in_bounds(), axis=0)
         return {
             "error": float(np.median(self.each)),
+            "error_low": low,
+            "error_high": high,
             **{f"error_{name}": float(of) for name, of in zip(ELEMENTS, medians, strict=True)},
             "none": float(np.mean(~answered)),
             "said": float(np.mean(answered & ~good)),
@@ -112,9 +118,17 @@ class Result(NamedTuple):
         }
 
 
-def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[Result]:
-    """One of our estimators, alone and batched; after the budget [s] other draws are left out."""
+def median_interval(values: np.ndarray) -> tuple[float, float]:
+    """The order statistics between which the median of the population lies, by the signs alone."""
+    ranks = scipy.stats.binom.interval(LEVEL, values.size, 0.5)
+    low, high = np.sort(values)[np.clip(np.array(ranks, int), 0, values.size - 1)]
+    return float(low), float(high)
+
+
+def ours(draws: Draws, drivers: Drivers, name: str) -> Iterator[Result]:
+    """One of our estimators, alone and batched; after its budget other draws are left out."""
     method, begin = method_of(name), np.inf
+    budget = np.inf if name == DEFAULT else BUDGET
     answers, usable, times = [], [], []
     for seed, study in enumerate(draws.studies):
         if len(answers) >= FEWEST and time.perf_counter() - begin > budget:
@@ -143,7 +157,7 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[R
     if usable:
         # One driver for all: it is the time that is measured.
         known = usable[0][1]
-        count = max(1, min(BATCH, round(budget / 3 / seconds)))
+        count = max(1, min(BATCH, round(TIMED / 3 / seconds)))
         batch = [usable[i % len(usable)][0] for i in range(count)]
         several = [
             timed(lambda: etid.identify_skins(batch, known, method=method))[1] for _ in range(3)
@@ -152,11 +166,12 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[R
         yield alone._replace(mode="batched", seconds=each, first_seconds=several[0])
 
 
-def theirs(draws: Draws, budget: float) -> Iterator[Result]:
+def theirs(draws: Draws) -> Iterator[Result]:
     """All rivals, each in its environment; what is missing is a result that says why."""
-    given = rivals.problem([(study[TRIAL], study[CALIBRATION]) for study in draws.studies], START)
+    studies = draws.studies[:OF_RIVALS]
+    given = rivals.problem([(study[TRIAL], study[CALIBRATION]) for study in studies], START)
     for module, rival in rivals.RIVALS.items():
-        outcome, name = rivals.run(module, given, 1, PATIENCE * budget, budget), rival.name
+        outcome, name = rivals.run(module, given, 1, PATIENCE * TIMED, TIMED), rival.name
         if outcome.missing:
             none = draws.answer(name, 0, "missing", NOTHING, NOTHING)
             yield Result(name, "rival", [none], missing=outcome.missing)
@@ -181,11 +196,9 @@ def rows_of(name: str, source: str, repetitions: int, quick: bool) -> list[dict[
     draws, drivers = Draws.of(ladder()[name], repetitions, SOURCES[source]), Drivers()
     modes = 1 if quick else None
     results = [
-        result
-        for of in OURS
-        for result in itertools.islice(ours(draws, drivers, of, BUDGET), modes)
+        result for of in OURS for result in itertools.islice(ours(draws, drivers, of), modes)
     ]
-    results += [] if quick else theirs(draws, BUDGET)
+    results += [] if quick else theirs(draws)
     scored = [result.row() for result in results]
     on_front = front([of.seconds for of in results], [of["error"] for of in scored])
     beaten_by = "; ".join(dominators(results))

@@ -64,11 +64,12 @@ def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     figure.supxlabel(
         "\n".join(
             textwrap.wrap(
-                "Filled: etid, its default method in bold; open: rivals. A line leads from one "
-                "recording a call to a batch. (In brackets): says itself that most of its answers "
-                "are not good. Dashed: what nothing beats in both. Grey: where an efficient "
-                f"estimator is. {min(ours)} to {max(ours)} draws of each of etid's methods, "
-                f"{min(theirs)} to {max(theirs)} of each rival.",
+                "Filled: etid, its default method in bold; open: rivals. Upright lines are 95 % "
+                "intervals of the medians, level ones lead from one recording a call to a batch. "
+                "(In brackets): says itself that most of its answers are not good. Dashed: what "
+                "nothing beats in both. Grey: where an efficient estimator is. "
+                f"{min(ours)} to {max(ours)} draws of each of etid's methods, {min(theirs)} to "
+                f"{max(theirs)} of each rival.",
                 150,
             )
         ),
@@ -101,6 +102,8 @@ def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> list[str]:
             marks += axes.plot(
                 [of["alone"]["ms"], best["ms"]], [error, error], color=charts.INK, linewidth=0.8
             )
+        scatter = np.clip([best["error_low"], best["error_high"]], None, WORST)
+        marks += axes.plot([best["ms"]] * 2, scatter, color=charts.INK, linewidth=0.8)
         marks += axes.plot(
             best["ms"],
             error,

@@ -16,9 +16,8 @@ from etid.estimators.registry import names
 
 README = ROOT / "benchmarks" / "README.md"
 BEGIN, END = "<!-- python -m benchmarks which -->\n", "<!-- end -->\n"
-AS_GOOD = 1.25  # times the smallest error, that an estimator may have to be used for its speed
 WORTH = 0.5  # of the time that the first of them takes, from which on that is a reason
-ENOUGH = 12  # draws of an estimator that is recommended: the median scatters by a seventh
+ENOUGH = 200  # draws of an estimator that is recommended: the interval of its median is ±13 %
 TRUSTED = 0.5  # part of the draws that have an answer which the estimator itself stands by
 
 OPTIONS = (
@@ -32,12 +31,15 @@ def read(path: pathlib.Path) -> list[dict[str, Any]]:
     """Rows of our estimators, with numbers as numbers."""
     with path.open() as file:
         rows = [row for row in csv.DictReader(file) if row["mode"] != "rival"]
-    numbers = ("draws", "error", "none", "said", "wrong", "silent", "ms")
+    numbers = ("draws", "error", "error_low", "error_high", "none", "said", "silent", "ms")
     return [{**row, **{name: float(row[name]) for name in numbers}} for row in rows]
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Markdown: a row for each scene with the error of each estimator, and which to use."""
+    """Markdown: a row for each scene with the error of each estimator, and which to use.
+
+    Behind an error is the 95 % interval of the median.
+    """
     of_method = {name: [row for row in rows if row["estimator"] == name] for name in names()}
     methods = [name for name, of in of_method.items() if of]
     heads = ["recording", *(name.replace("_", " ") for name in methods), "use"]
@@ -60,17 +62,20 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def best(rows: Sequence[Row]) -> str | None:
-    """The first that is trusted and as good as the best, or one such that takes half its time."""
+    """The first that is as good as the best, within the scatter, or one that takes half its time.
+
+    Only what is trusted counts, and only what has enough draws is used.
+    """
     trusted = [
         row
         for row in sorted(rows, key=lambda row: OURS.index(row["estimator"]))
         if row["estimator"] in names() and row["silent"] == 0 and np.isfinite(row["error"])
-        if _is_trusted(row) and row["draws"] >= ENOUGH
+        if _is_trusted(row)
     ]
-    if not trusted:
+    limit = min((row["error_high"] for row in trusted), default=np.nan)
+    good = [row for row in trusted if row["error_low"] <= limit and row["draws"] >= ENOUGH]
+    if not good:
         return None
-    limit = AS_GOOD * min(row["error"] for row in trusted)
-    good = [row for row in trusted if row["error"] <= limit]
     fastest = min(good, key=lambda row: row["ms"])
     return (fastest if fastest["ms"] <= WORTH * good[0]["ms"] else good[0])["estimator"]
 
@@ -82,10 +87,14 @@ def _is_trusted(row: Row) -> bool:
 def _cell(row: Row | None, used: bool) -> str:
     if row is None or not np.isfinite(row["error"]):
         return "-"
-    text = f"{row['error']:.2g}" if row["error"] < 100 else f"{row['error']:.0f}"
-    text = text if _is_trusted(row) else f"({text})"
+    text, low, high = (_short(row[name]) for name in ("error", "error_low", "error_high"))
+    text = f"{text} ({low} to {high})" if _is_trusted(row) else f"[{text}]"
     text += " silent" if row["silent"] > 0 else ""
     return f"**{text}**" if used else text
+
+
+def _short(number: float) -> str:
+    return f"{number:.2g}" if number < 100 else f"{number:.0f}"
 
 
 def inserted(text: str, made: str) -> str:
