@@ -164,10 +164,11 @@ axes = etid.plot(index, by=("session", "subject"))
 # %% [markdown]
 # `etid.variation` divides what differs: between subjects, between the days of a subject, between
 # the fingers of a day, and between the electrodes of a finger. The errors of the fits are in none
-# of them. Two subjects say little about subjects, and the interval shows it.
+# of them, nor are those of the drivers: each session has a driver of its own. Two subjects say
+# little about subjects, and the interval shows it.
 
 # %%
-variation = etid.variation(fits, "r_p")
+variation = etid.variation(fits, "r_p", driver="session")
 print(variation)
 
 # %% [markdown]

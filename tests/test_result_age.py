@@ -13,7 +13,10 @@ MADE_BY = {  # tables whose names are not those of their benchmarks
     "selection_map": "selection",
 }
 # No number of a benchmark depends on them.
-SHOWN = ("cli.py", "commands", "files", "live", "paper", "plotting", "report")
+SHOWN = (
+    *("cli.py", "commands", "files", "live", "paper", "plotting", "report"),
+    *("results/variation.py", "simulation/calibration.py"),
+)
 
 
 def git(*arguments):

@@ -1,12 +1,13 @@
 """How much an element varies between subjects, sessions and recordings, beyond its errors.
 
 The logarithms of an element are a sum of random effects, nested in each other, and of the errors of
-the fits, whose standard deviations s are known:
+the fits and of their drivers, whose standard deviations s and a are known:
 
-    y = μ + Σ_r Z_r u_r + e,    u_r ~ N(0, σ_r²),    e ~ N(0, diag(s²)).
+    y = μ + Σ_r Z_r u_r + e + A d,    u_r ~ N(0, σ_r²),    e ~ N(0, diag(s²)),    d ~ N(0, 1).
 
-σ_r are those of the largest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971,
-545-554), their intervals those of its profile. It needs no balanced design.
+A has a column for each driver, with a of its fits: they share one error. σ_r are those of the
+largest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971, 545-554), their
+intervals those of its profile. It needs no balanced design.
 """
 
 import dataclasses
@@ -47,10 +48,14 @@ class Variation(Overviewed):
         unit: Its SI unit.
         fits: Number of successful fits.
         mean: Geometric mean [SI].
-        stderr: Its standard error [SI]: how far it is from that of all subjects.
+        stderr: Its standard error [SI], with that of the drivers: how far it is from that of all
+            subjects.
         between: The variation between the groups of each level, such as `subject`, and between
             the `recordings` of the last level; relative to the mean.
         error: Median of the relative standard errors of the fits, without that of the driver.
+        driver_error: Median of the relative errors that come from the driver.
+        driver: Label whose groups have a driver of their own; empty if all fits share one.
+        unused: Labels that divide nothing, and so are no levels.
     """
 
     element: str
@@ -60,30 +65,48 @@ class Variation(Overviewed):
     stderr: float
     between: Mapping[str, Part]
     error: float
+    driver_error: float
+    driver: str
+    unused: Sequence[str]
 
     def _overview(self) -> Overview:
         rows = [
-            (f"between {name}{'' if name == REST else 's'}", *(f"{100 * x:.2g} %" for x in part))
+            (f"between {name}{'' if name == REST else 's'}", *map(_per_cent, part))
             for name, part in self.between.items()
         ]
-        rows.append(("error of a fit", f"{100 * self.error:.2g} %", "", ""))
+        rows.append(("error of a fit", _per_cent(self.error), "", ""))
+        of = f"each {self.driver}" if self.driver else "all"
+        rows.append((f"error of the driver of {of}", _per_cent(self.driver_error), "", ""))
         title = f"{self.element} of {self.fits} fits: {quantity(self.mean, self.unit, self.stderr)}"
-        return Overview(title, rows, ("variation", "standard deviation", "95 % from", "to"))
+        heads = "variation", "standard deviation", "95 % from", "to"
+        names = ", ".join(self.unused)
+        notes = [f"no groups of several fits by {names}"] if names else []
+        return Overview(title, rows, heads, notes=notes)
+
+
+def _per_cent(part: float) -> str:
+    return f"{100 * part:.0f} %" if part >= 1 else f"{100 * part:.2g} %"
 
 
 def variation(
-    fits: Fits, element: str, by: Sequence[str] = ("subject", "session", "site")
+    fits: Fits,
+    element: str,
+    by: Sequence[str] = ("subject", "session", "site"),
+    *,
+    driver: str = "",
 ) -> Variation:
     """Variation of an element between subjects, their sessions, and so on, beyond its errors.
 
-    The error of a driver is common to all of its recordings, so it is no variation between them.
-    Where sessions have calibrations of their own, it is part of the variation between sessions.
+    The error of a driver is common to all of its recordings, so it is no variation between them,
+    but an error of their mean. Where sessions have calibrations of their own, say so by
+    `driver="session"`: else the errors of their drivers count as variation between sessions.
 
     Args:
         fits: Fits of one condition; those without success are left out.
         element: Name of the element.
         by: Labels, each nested in those before it. A label that does not divide the groups of
             those before it further, or that leaves one recording in each group, is no level.
+        driver: Label whose groups have calibrations of their own, such as `session`.
 
     Returns:
         The geometric mean, and the standard deviation of each level with its interval.
@@ -95,16 +118,20 @@ def variation(
     units = fits.circuit.units()
     if element not in units:
         raise ValueError(f"the element is {element!r}, must be one of {', '.join(units)}")
-    check_names(dict.fromkeys(by), LABELS, "label")
+    check_names(dict.fromkeys((*by, *([driver] if driver else []))), LABELS, "label")
     good = fits.successful()
     values = np.asarray(getattr(good.circuit, element))
     place = list(units).index(element)
-    own = np.asarray(good.cov - good.fit.shared_cov)[:, place, place]
-    y, s = np.log(values), np.sqrt(np.maximum(own, 0.0)) / values
+    shared = np.asarray(good.fit.shared_cov)[:, place, place]
+    own = np.asarray(good.cov)[:, place, place] - shared
+    y = np.log(values)
+    s, a = (np.sqrt(np.maximum(of, 0.0)) / values for of in (own, shared))
     levels = _levels([good.labels[name].astype(str) for name in by], by, len(values))
     if len(values) < 2 or not levels:
         raise ValueError(f"{len(values)} successful fits show no variation by {', '.join(by)}")
-    model = _Model.of(y, s, list(levels.values()))
+    names = good.labels[driver].astype(str) if driver else np.zeros(y.size)
+    drivers = a[:, None] * (names[:, None] == np.unique(names))
+    model = _Model.of(y, s, list(levels.values()), drivers)
     best, mean, stderr = model.fitted()
     between = {}
     for row, name in enumerate(levels):
@@ -112,7 +139,16 @@ def variation(
         between[name] = Part(float(best[row]), *ends)
     middle = float(np.exp(mean))
     return Variation(
-        element, units[element], len(values), middle, middle * stderr, between, float(np.median(s))
+        element=element,
+        unit=units[element],
+        fits=len(values),
+        mean=middle,
+        stderr=middle * stderr,
+        between=between,
+        error=float(np.median(s)),
+        driver_error=float(np.median(a)),
+        driver=driver,
+        unused=[name for name in by if name not in levels],
     )
 
 
@@ -139,18 +175,22 @@ class _Model:
         y: Logarithms.
         noise: Their squared errors.
         levels: Group of each logarithm, by level, numbered from 0.
+        drivers: Errors of the drivers, (logarithm, driver).
         spread: Standard deviation of the logarithms.
     """
 
     y: np.ndarray
     noise: np.ndarray
     levels: Sequence[np.ndarray]
+    drivers: np.ndarray
     spread: float
 
     @classmethod
-    def of(cls, y: np.ndarray, s: np.ndarray, levels: Sequence[np.ndarray]) -> "_Model":
+    def of(
+        cls, y: np.ndarray, s: np.ndarray, levels: Sequence[np.ndarray], drivers: np.ndarray
+    ) -> "_Model":
         spread = float(np.std(y)) or 1.0
-        return cls(y, s**2 + (FINE * spread) ** 2, levels, spread)
+        return cls(y, s**2 + (FINE * spread) ** 2, levels, drivers, spread)
 
     def deviance(self, std: np.ndarray) -> float:
         """−2 ln of the restricted likelihood."""
@@ -159,13 +199,18 @@ class _Model:
     def _parts(self, std: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """The deviance, P = V⁻¹ − V⁻¹1 1ᵀV⁻¹ / 1ᵀV⁻¹1, and V⁻¹1."""
         inverse, logs = np.zeros((self.y.size, self.y.size)), 0.0
-        for group in range(self.levels[0].max() + 1):  # the groups are independent
+        for group in range(self.levels[0].max() + 1):  # independent but for the drivers
             rows = np.flatnonzero(self.levels[0] == group)
             v = np.diag(self.noise[rows])
             for one, of in zip(std, self.levels, strict=True):
                 v += one**2 * (of[rows][:, None] == of[rows])
             logs += float(np.linalg.slogdet(v)[1])
             inverse[np.ix_(rows, rows)] = np.linalg.inv(v)
+        # (V + A Aᵀ)⁻¹ = V⁻¹ − V⁻¹A (1 + AᵀV⁻¹A)⁻¹ AᵀV⁻¹
+        of = inverse @ self.drivers
+        inner = np.eye(of.shape[1]) + self.drivers.T @ of
+        logs += float(np.linalg.slogdet(inner)[1])
+        inverse -= of @ np.linalg.solve(inner, of.T)
         ones = inverse.sum(0)
         p = inverse - np.outer(ones, ones) / ones.sum()
         return logs + float(np.log(ones.sum()) + self.y @ p @ self.y), p, ones
