@@ -74,6 +74,27 @@ def test_a_wrong_resistor_is_named(scene, today):
     assert found.shifts["dry"]["r_p"] == pytest.approx(98.8 / 93.9 - 1, rel=0.05)
 
 
+def test_skin_in_place_of_the_resistor_is_no_other_resistor(scene, today):
+    skin = scene.simulate(seed=5)["typical/dry/02"].replace(r_load=98.8e3, calibration=())
+    found = etid.calibrate(skin, former=today.driver)
+    assert found.moved > 100
+    assert found.r_load is None
+    assert "no other resistor explains it: were 98.8 kΩ connected" in str(found)
+
+
+def test_the_line_on_what_helps_is_that_of_the_least_known_element(today):
+    names = "r_s", "r_p", "c_p"
+    known = {"dry": {NOW: (0.02, 0.001, 0.001), MORE: (0.01, 5e-4, 5e-4)}}
+    known["damp"] = {NOW: (0.031, 0.01, 0.01), "also with 10 kΩ": (0.008, 0.009, 0.01)}
+    by_skin = {
+        skin: {what: dict(zip(names, errors, strict=True)) for what, errors in by.items()}
+        for skin, by in known.items()
+    }
+    text = str(dataclasses.replace(today, expected=by_skin))
+    assert "r_s of damp skin is least known; also with 10 kΩ helps most: 0.8 %" in text
+    assert "1 % takes 10 times as many periods" in text  # (0.031 / 0.01)² = 9.6
+
+
 def test_the_command_writes_a_driver_and_a_picture(scene, today, tmp_path, capsys, monkeypatch):
     study, driver, picture = (tmp_path / name for name in ("study.h5", "driver.h5", "z.svg"))
     scene.simulate(seed=0).write(study)

@@ -31,6 +31,7 @@ LONGER = 4.0  # times as many periods
 NOW, MORE = "as now", f"{LONGER:g} times as many periods"  # what is recorded
 BAND = np.geomspace(300.0, 60e3, 24)  # [Hz] where drivers are compared
 MOVED = 4.0  # standard errors; two good calibrations differ by more once in 2 000 pairs
+GOAL = 0.01  # standard error of an element for which the number of periods is told
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -71,27 +72,45 @@ class CheckedCalibration(Overviewed):
             "standard errors to expect of skin:",
             rows,
             ("skin", "recorded", *SkinRC().names()),
-            notes=self._since(),
+            notes=[self._what_helps(), *self._since()],
         )
         known = Overview(several(len(records), "calibration") + ":", records, heads)
         return dataclasses.replace(self.driver._overview(), then=(known, errors))
 
+    def _what_helps(self) -> str:
+        """What makes the largest error smaller, and how many periods make it 1 %."""
+        error, skin, name = max(
+            (error, skin, name)
+            for skin, by in self.expected.items()
+            for name, error in by[NOW].items()
+        )
+        then, what = min(
+            (errors[name], what) for what, errors in self.expected[skin].items() if what != NOW
+        )
+        text = f"{name} of {skin} skin is least known; {what} helps most: {100 * then:.2g} %"
+        times = np.ceil((error / GOAL) ** 2)
+        return text + (f"; 1 % takes {times:.0f} times as many periods" if times > 1 else "")
+
     def _since(self) -> list[str]:
         if not np.isfinite(self.moved):
             return []
-        lines = [f"|Z_th| differs from the former driver by {self.moved:.1f} standard errors"]
-        if self.moved > MOVED and self.r_load is not None:
-            lines.append(
-                f"a resistor of {self.r_load / 1e3:.4g} kΩ in place of "
-                f"{(self.driver.recordings[0].r_load or 0.0) / 1e3:.4g} kΩ would explain it"
-            )
-        if self.moved > MOVED:
-            lines += [
+        moved = f"|Z_th| differs from the former driver by {self.moved:.1f} standard errors"
+        if self.moved <= MOVED:
+            return [moved]
+        told = f"{(self.driver.recordings[0].r_load or 0.0) / 1e3:.4g} kΩ"
+        if self.r_load is None:
+            cause = f"no other resistor explains it: were {told} connected, and this driver?"
+        else:
+            cause = f"a resistor of {self.r_load / 1e3:.4g} kΩ in place of {told} would explain it"
+        return [
+            f"Warning: {moved}",
+            cause,
+            *(
                 f"with the former driver, {skin} skin would be wrong by "
                 + ", ".join(f"{name} {100 * shift:+.2g} %" for name, shift in by.items())
                 for skin, by in self.shifts.items()
-            ]
-        return lines
+            ),
+        ]
 
 
 @in_float64
@@ -221,18 +240,16 @@ def _with_resistor(records: Sequence[Recording], driver: Driver, r: float) -> Dr
 
 def _compared(of: CheckedCalibration, former: Driver) -> CheckedCalibration:
     """How far |Z_th| is from that of a former driver, and which resistor would explain it."""
-    f = jax.device_put(BAND)
-    (z, of_z), (old, of_old) = (
-        (np.log(np.abs(np.asarray(one.response(f)))), np.asarray(one.log_response_stderr(f))[0])
-        for one in (of.driver, former)
-    )
-    spread = np.hypot(of_z, of_old)
-    moved = float(np.max(np.abs(z - old) / spread))
-    ratio = float(np.average(z - old, weights=1 / spread**2))
-    rest = float(np.max(np.abs(z - old - ratio) / spread))
+    f, drivers = jax.device_put(BAND), (of.driver, former)
+    z, old = (np.asarray(one.response(f)) for one in drivers)
+    # Of ln |Z_th| and of the phase, which a wrong resistor leaves as it is.
+    spread = np.hypot(*(np.asarray(one.log_response_stderr(f)) for one in drivers))
+    change = np.stack([np.log(np.abs(z / old)), np.angle(z / old)])
+    ratio = float(np.average(change[0], weights=1 / spread[0] ** 2))
+    explains = bool(np.max(np.abs(change - [[ratio], [0.0]]) / spread) < MOVED)
     r_load = of.driver.recordings[0].r_load or float("nan")
     return dataclasses.replace(
         of,
-        moved=moved,
-        r_load=r_load / np.exp(ratio) if rest < MOVED else None,
+        moved=float(np.max(np.abs(change[0]) / spread[0])),
+        r_load=r_load / np.exp(ratio) if explains else None,
     )
