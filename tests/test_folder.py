@@ -5,7 +5,7 @@ import etid
 from etid.cli import main
 from etid.files.folder import import_folder, labelled, resistance
 from etid.files.importing import import_file
-from etid.files.pattern import Pattern
+from etid.files.pattern import pattern
 from etid.recordings.recording import RecordingError
 
 OPTIONS = {"v_th": "open", "v_out": "skin", "time": "t", "scale": 0.5, "pulse_rate": 60.0}
@@ -81,7 +81,8 @@ def test_a_table_names_resistors_of_files_whose_names_do_not(folder):
     ],
 )
 def test_a_name_that_could_be_read_in_two_ways_does_not_match(name, labels):
-    assert Pattern("{subject}_{condition}_{trial}.csv").labels(name) == labels
+    match = pattern("{subject}_{condition}_{trial}.csv").fullmatch(name)
+    assert (match and match.groupdict()) == labels
 
 
 @pytest.mark.parametrize(

@@ -141,10 +141,7 @@ def test_matlab_variables_that_are_no_real_arrays_are_refused_in_both_versions(t
             refused(path, said, rf"v_out: '{name}' is .*must be an array of real numbers")
 
 
-def test_matlab_7_3_needs_no_package_and_cells_and_references_are_no_channels(
-    tmp_path, monkeypatch
-):
-    monkeypatch.setitem(sys.modules, "pymatreader", None)
+def test_cells_and_references_of_matlab_7_3_are_no_channels(tmp_path):
     path = matlab(tmp_path / "m.mat", 7.3, **{"#refs#": {"a": V_TH}}, open=V_TH, skin=V_OUT)
     target = tmp_path / "m.h5"
     etid.import_file(path, target, v_th="open", v_out="skin", sample_rate=2e5, **GIVEN)
@@ -299,12 +296,14 @@ def test_time_stamps_are_checked_in_every_part(small_parts, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "package"), [("a.tdms", "npTDMS"), ("a.abf", "pyabf"), ("a.mat", "pymatreader")]
+    ("name", "package", "extra"),
+    [("a.tdms", "npTDMS", "tdms"), ("a.abf", "pyabf", "abf"), ("a.xlsx", "openpyxl", "excel")],
 )
-def test_without_its_reader_a_file_names_what_to_install(name, package, tmp_path, monkeypatch):
+def test_without_its_reader_a_file_names_what_to_install(
+    name, package, extra, tmp_path, monkeypatch
+):
     monkeypatch.setitem(sys.modules, package.lower(), None)
     (tmp_path / name).write_bytes(b"anything")
-    extra = {"npTDMS": "tdms", "pyabf": "abf", "pymatreader": "matlab"}[package]
     refused(tmp_path / name, pair(), rf"needs the package {package}.*'etid\[{extra}\]'")
 
 

@@ -96,7 +96,7 @@ A, B = "[[recording]]\npath = 'a'\n", "[[recording]]\npath = 'b'\n"
         ("rig/skin", "rig/slow", "differs between the channels: .* 'rig/slow' 1000 Hz"),
         ("rig/skin", "rig/near", "differs between the channels: .* 'rig/near' 199996 Hz"),
         ("scale", "sample_rate = 100e3\nscale", "sample_rate: is 100000 Hz from the mapping"),
-        ("0.0535", "true", "scale: is True, must be a finite number"),
+        ("0.0535", "true", "scale: is True, must be a finite real number"),
         ("60.0", "inf", "pulse_rate: is inf, must be a finite real"),
         ("scale", "subject = 1.5\nscale", "subject: is 1.5, must be text"),
         ("scale", 'calibration = "c/0"\nscale', "calibration: 'c/0' is not a calibration of the"),
