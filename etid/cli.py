@@ -83,15 +83,15 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
     """
     arguments = commands.parse_args(words)
     source = getattr(arguments, "source", [])
-    if any(_same_file(one, arguments.target) for one in np.ravel([source])):
+    read = [one for one in np.ravel([source]) if one.exists()]
+    if any(arguments.target.exists() and one.samefile(arguments.target) for one in read):
         commands.error(f"{arguments.target} is the file to read; name another file to write")
-    from etid.commands.outputs import check_outputs
     from etid.recordings.errors import RecordingError
     from etid.results.fit import IdentificationError
 
     try:
         if "force" in arguments:
-            check_outputs(arguments.module.outputs(arguments), force=arguments.force)
+            _check_outputs(arguments.module.outputs(arguments), force=arguments.force)
         with _logged() if arguments.verbose else contextlib.nullcontext():
             outcome = arguments.module.run(arguments)
     except (RecordingError, IdentificationError, ValueError, OSError) as error:
@@ -106,6 +106,28 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
         data = {"command": arguments.command, "status": outcome.status, **outcome.data}
         text = json.dumps(_plain(data), ensure_ascii=False, allow_nan=False)
     return max(outcome.status, _print(text))
+
+
+def _check_outputs(outputs: Mapping[pathlib.Path, tuple[str, ...]], *, force: bool) -> None:
+    """Raise an error if a file cannot be written, or would be overwritten.
+
+    Args:
+        outputs: The endings that the name of each file may have. A name without the ending of a
+            known format is always right.
+        force: Whether existing files may be replaced.
+    """
+    from etid.recordings.replacing import check_ending
+
+    for path, endings in outputs.items():
+        if path.is_dir():
+            raise ValueError(f"{path}: this is a folder; name a file")
+        if path.exists() and not path.is_file():  # it would be replaced
+            raise ValueError(f"{path}: this is a device or a pipe; name a file")
+        if not path.absolute().parent.is_dir():
+            raise ValueError(f"{path}: the folder of this file does not exist")
+        check_ending(path, endings)
+        if path.exists() and not force:
+            raise ValueError(f"{path}: this file exists; add --force to replace it")
 
 
 @contextlib.contextmanager
@@ -144,7 +166,12 @@ def parser(wanted: Iterable[str] = COMMANDS) -> argparse.ArgumentParser:
     parser.add_argument(
         "--verbose", action="store_true", help="say on stderr what is done to each recording"
     )
-    parser.add_argument("--version", action=_Version, help="print versions")
+    of = importlib.metadata.version
+    versions = f"etid {etid.__version__}, JAX {of('jax')}, NumPy {np.__version__}"
+    machine = f"Python {platform.python_version()}, {platform.machine()}"
+    parser.add_argument(
+        "--version", action="version", version=f"{versions}, {machine}", help="print versions"
+    )
     parser.add_argument(
         "--completion",
         action=_Completion,
@@ -175,19 +202,6 @@ def _module(name: str) -> Any:
     jax.config.update("jax_enable_x64", True)
     _keep_programs(jax.config)
     return importlib.import_module(f"etid.commands.{name}")
-
-
-class _Version(argparse.Action):
-    """Print the versions for a bug report, and exit."""
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(nargs=0, **options)
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        of = importlib.metadata.version
-        versions = f"etid {etid.__version__}, JAX {of('jax')}, NumPy {np.__version__}"
-        print(f"{versions}, Python {platform.python_version()}, {platform.machine()}")
-        parser.exit()
 
 
 class _Completion(argparse.Action):
@@ -251,10 +265,6 @@ def _keep_programs(config: Any) -> None:
     if os.access(folder, os.W_OK):
         config.update("jax_compilation_cache_dir", str(folder))
         config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
-def _same_file(source: pathlib.Path, target: pathlib.Path) -> bool:
-    return source.exists() and target.exists() and source.samefile(target)
 
 
 def _plain(value: Any) -> Any:
