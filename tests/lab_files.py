@@ -21,7 +21,9 @@ def imported(source, mapping=None, **given):
     used = etid.import_file(source, target, mapping, **given)
     assert hdf5.check(target) == []
     with hdf5.read(target) as study:
-        return dict(study), used
+        found = dict(study)
+    target.unlink()
+    return found, used
 
 
 def refused(source, mapping, message, **given):

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import scipy.io.wavfile
 
-import etid
 from tests import lab_files
-from tests.lab_files import LINE, rig, table
+from tests.lab_files import table
 
 COUNT = 30
 V_TH = np.round(np.random.default_rng(8).normal(size=COUNT), 3)
@@ -40,26 +39,6 @@ def rows(sign=".", between=",", end=""):
 # Tables
 
 
-@pytest.mark.parametrize("cell", ["1.234", "-12.345.678", "0.5"])
-def test_a_point_is_no_decimal_sign_beside_decimal_commas(cell, tmp_path):
-    lines = rows(",", ";")
-    lines[7] = f"0,000035;{cell};1,5\n"
-    path = table(tmp_path, "t [s];open;skin\n" + "".join(lines))
-    told = {"delimiter": ";", "decimal": ","}
-    refused(path, f"line 9 has the cell '{cell}', but the decimal sign is a comma", **told, **RATE)
-
-
-@pytest.mark.parametrize(
-    ("row", "cells"), [("0.0,-1,23,4,56", 5), ("0.0,1,5,2.5", 4), ("-1.23,4.56", 2)]
-)
-@pytest.mark.parametrize("end", ["", ","])
-def test_a_row_whose_cells_are_shifted_is_named(row, cells, end, tmp_path):
-    lines = rows(end=end)
-    lines[20] = row + "\n"
-    path = table(tmp_path, f"t,open,skin{end}\n" + "".join(lines))
-    refused(path, f"line 22 has {cells} cells; the table has", **RATE)
-
-
 def test_notes_quotes_and_delimiters_at_the_end_are_no_fault(tmp_path):
     ends = ["\n", ",\n", ",fine\n", ',"fine, though"\n', ",,\n"]
     lines = [line[:-1] + ends[i % len(ends)] for i, line in enumerate(rows())]
@@ -82,7 +61,6 @@ def test_a_table_that_ends_inside_a_number_is_taken_with_a_notice(sign, between,
     assert notice.startswith(f"the last number, '{last}', is shorter than those above")
     assert one.v_out[-1] == float(last.replace(",", "."))
     refused_end = whole.rpartition(between)[0]
-    tmp_path.joinpath("a.h5").unlink()
     refused(table(tmp_path, refused_end), "has 2 cells; the table has", **told, **RATE)
 
 
@@ -98,11 +76,9 @@ def test_the_preamble_of_an_oscilloscope_is_compared_with_its_table(tmp_path):
     assert imported(scope("3.0e+01", "5,us"), **told)[1] == ()
     without, _ = imported(scope(30, "5e-06"), header_line=4)
     assert without.sample_rate == 200e3
-    _, [notice] = imported(scope(40, "5e-06"), **told)
-    assert notice == "the table has 30 rows, its preamble declares 40 samples"
-    [used] = etid.import_file(tmp_path / "a.csv", tmp_path / "a.h5", **{**GIVEN, **told})
+    _, [used] = lab_files.imported(scope(40, "5e-06"), **{**GIVEN, **told})
+    notice = "the table has 30 rows, its preamble declares 40 samples"
     assert str(used).endswith(f"\n  note: {notice}")
-    tmp_path.joinpath("a.h5").unlink()
     refused(scope(30, "1e-05"), "is 200000 Hz from the time 't', but 100000 Hz from the f", **told)
 
 
@@ -168,16 +144,3 @@ def test_a_wav_file_that_was_cut_off_is_refused_wherever_it_was(kind, tmp_path):
     text = b"LIST" + (4).to_bytes(4, "little") + b"INFO"
     path.write_bytes(whole + text)  # as sound editors append it
     assert imported(path, **given)[0].sample_rate == 200e3
-
-
-RIG = {"v_th": "rig/open", "v_out": "rig/skin"}
-
-
-@pytest.mark.parametrize("kind", ["i2", "f4", "f8"])
-def test_a_scaling_that_leaves_no_samples_is_refused(kind, tmp_path):
-    codes = np.arange(COUNT).astype(kind)
-    for name, value in (("Slope", 0.0), ("Slope", np.nan), ("Y_Intercept", np.inf)):
-        path = rig(tmp_path, V_TH, codes, **LINE | {f"NI_Scale[0]_Linear_{name}": value})
-        refused(path, "v_out: channel 'rig/skin' is scaled with slope", **RIG)
-    one, _ = imported(rig(tmp_path, V_TH, codes, **LINE), **RIG)
-    np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * np.arange(COUNT), rtol=1e-15)

@@ -131,6 +131,8 @@ def times(*stamps):
 
 BY_TIME = {"sample_rate": None, "time": "t"}
 ROWS = "t,th,out,i\n0,1,2,3\n1,4,5,6\n"
+COMMAS, SAID = "t;th;out\n0;1,5;2,5\n1;{};1,5\n", {"delimiter": ";", "decimal": ","}
+SHIFTED = "t,th,out{0}\n0,1.5,2.5{0}\n{1}\n0,1.5,2.5{0}\n"
 
 
 @pytest.mark.parametrize(
@@ -149,10 +151,15 @@ ROWS = "t,th,out,i\n0,1,2,3\n1,4,5,6\n"
         (times(0, -1, -2, -3, -4), BY_TIME, "time: does not increase"),
         (times(0, 1, np.nan, 3, 4), BY_TIME, "time: is not uniform"),
         (times(*[np.nan] * 5), BY_TIME, "time: does not increase"),
-        (ROWS, {"v_th": "Vth"}, r"v_th: there is no 'Vth'; the names are 't', 'th', 'out', 'i'"),
-        (ROWS, {"v_out": None}, "v_out: is not given, and is not guessed"),
-        (ROWS, {"pulse_rate": None}, "pulse_rate: is not given"),
-        (ROWS, {"scale": None}, "scale: is not given.*1 if the values are those at the terminal"),
+        (COMMAS.format("1.234"), SAID, "line 3 has the cell '1.234', but the decimal sign is a"),
+        (COMMAS.format("-12.345.678"), SAID, "line 3 has the cell '-12.345.678', but"),
+        (COMMAS.format("0.5"), SAID, "line 3 has the cell '0.5', but the decimal sign is a comma"),
+        (SHIFTED.format(",", "0.0,-1,23,4,56"), {}, "line 3 has 5 cells; the table has"),
+        (SHIFTED.format("", "0.0,-1,23,4,56"), {}, "line 3 has 5 cells; the table has"),
+        (SHIFTED.format(",", "0.0,1,5,2.5"), {}, "line 3 has 4 cells; the table has"),
+        (SHIFTED.format("", "0.0,1,5,2.5"), {}, "line 3 has 4 cells; the table has"),
+        (SHIFTED.format(",", "-1.23,4.56"), {}, "line 3 has 2 cells; the table has"),
+        (SHIFTED.format("", "-1.23,4.56"), {}, "line 3 has 2 cells; the table has"),
         (ROWS, {"sample_rate": None}, "one of time and sample_rate"),
         (ROWS, {"time": "t"}, "one of time and sample_rate"),
     ],
@@ -178,9 +185,3 @@ def test_matlab_trials_are_rows_and_codes_stay_integers(version, tmp_path):
     np.testing.assert_array_equal(
         imported(column, **TABLE | {"scale": 1})["loaded/0"].v_out, TH / 2
     )
-
-
-def test_a_field_of_a_matlab_structure_has_a_dotted_name(tmp_path):
-    path = matlab(tmp_path / "m.mat", 5, scope={"th": TH, "out": TH / 2, "who": "me"})
-    arguments = {**TABLE, "v_th": "scope.th", "v_out": "scope.out"}
-    assert imported(path, **arguments)["loaded/0"].v_th.size == 5
