@@ -62,6 +62,16 @@ def without_driver(tmp_path_factory):
     return path
 
 
+def as_json(printed):
+    """The one object that stands on stdout; NaN and Infinity are no JSON."""
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    (line,) = printed
+    return json.loads(line, parse_constant=refuse)
+
+
 def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_path):
     files = [tmp_path / name for name in ("a.h5", "b.h5", "c.h5")]
     for file, seed in zip(files, (1, 1, 2), strict=True):
@@ -157,8 +167,24 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     assert any(line.startswith("typical/dry/02: nonfinite_samples. ") for line in printed)
     fits = etid.Fits.read(target)
     assert fits.labels["path"].tolist() == [f"typical/dry/{i:02d}" for i in (1, 2, 3, 4, 99)]
-    assert fits.counts() == {"successful": 3, "nonfinite_samples": 1, "unreadable": 1}
     assert "typical/dry/99" in fits.notes[-1]
+
+    _, printed, _ = run("fit", study_file, "-o", target, "--json", "--force")
+    data = as_json(printed)
+    told = {"command": "fit", "status": DONE, "source": str(study_file), "target": str(target)}
+    told |= {"method": "maximum_likelihood", "recordings": 5}
+    told |= {"units": {"r_s": "ohm", "r_p": "ohm", "c_p": "farad"}}
+    assert data.items() >= told.items()
+    expected = {"successful": 3, "nonfinite_samples": 1, "unreadable": 1}
+    assert data["verdicts"] == fits.counts() == expected
+    (driver,) = data["drivers"]
+    assert driver["calibrations"] == ["calibration/98k8"]
+    assert (driver["verdict"], driver["order"]) == ("successful", 5)
+    assert 0 < driver["rrse"] < 0.01
+    assert data["groups"][-1] == fits.summary("subject", "condition")[-1]
+    failed, _ = data["unsuccessful"]
+    assert (failed["path"], failed["verdict"]) == ("typical/dry/02", "nonfinite_samples")
+    assert failed["note"]
 
 
 def test_fit_joint_fits_all_recordings_together(run, study_file, tmp_path, monkeypatch):
@@ -227,10 +253,13 @@ def test_an_error_is_one_line_without_a_traceback(
     (tmp_path / "garbage.h5").write_bytes(b"no HDF5")
     (tmp_path / "table.csv").write_text("open,skin\n1,2\n")
     etid.scenes.paper_calibration().simulate(seed=0).write(tmp_path / "calibration.h5")
-    status, printed, complaints = run(*command.split())
-    assert (status, printed, len(complaints)) == (WRONG_DATA, [], 1)
-    assert complaints[0].startswith("etid: error: ")
-    assert words in complaints[0]
+    status, printed, [complaint] = run(*command.split())
+    assert (status, printed) == (WRONG_DATA, [])
+    assert complaint.startswith("etid: error: ")
+    assert words in complaint
+    status, printed, again = run(*command.split(), "--json")
+    error = {"command": command.split()[0], "status": status, "error": complaint[13:]}
+    assert (again, as_json(printed)) == ([complaint], error)
 
 
 @pytest.mark.parametrize("command", ["fit", "import"])
@@ -240,38 +269,6 @@ def test_the_file_that_is_read_is_never_replaced(run, study_file, command):
     assert status == WRONG_USAGE
     assert "is the file to read; name another file to write" in complaints[-1]
     assert study_file.read_bytes() == before
-
-
-def as_json(printed):
-    """The one object that stands on stdout; NaN and Infinity are no JSON."""
-
-    def refuse(constant):
-        raise AssertionError(f"{constant} is no JSON")
-
-    (line,) = printed
-    return json.loads(line, parse_constant=refuse)
-
-
-def test_json_of_fit_has_what_the_text_has(run, study_file, tmp_path):
-    target = tmp_path / "fits.h5"
-    status, printed, complaints = run("fit", study_file, "-o", target, "--json")
-    assert (status, complaints) == (DONE, [])
-    data = as_json(printed)
-    fits = etid.Fits.read(target)
-    files = {"source": str(study_file), "target": str(target)}
-    assert data.items() >= {"command": "fit", "status": DONE, **files}.items()
-    assert (data["method"], data["recordings"]) == ("maximum_likelihood", 4)
-    assert data["verdicts"] == fits.counts() == {"successful": 3, "nonfinite_samples": 1}
-    (driver,) = data["drivers"]
-    assert driver["calibrations"] == ["calibration/98k8"]
-    assert (driver["verdict"], driver["order"]) == ("successful", 5)
-    assert 0 < driver["rrse"] < 0.01
-    (group,) = data["groups"]
-    assert group == fits.summary("subject", "condition")[0]
-    assert data["units"] == {"r_s": "ohm", "r_p": "ohm", "c_p": "farad"}
-    (failed,) = data["unsuccessful"]
-    assert (failed["path"], failed["verdict"]) == ("typical/dry/02", "nonfinite_samples")
-    assert failed["note"]
 
 
 def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
@@ -317,13 +314,6 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
         assert {key for item in groups for key in item} <= told, command
 
 
-def test_json_of_an_error_is_on_stdout_and_its_line_on_stderr(run):
-    status, printed, complaints = run("fit", "absent.h5", "-o", "fits.h5", "--json")
-    data = as_json(printed)
-    assert status == data["status"] == WRONG_DATA
-    assert (data["command"], complaints) == ("fit", [f"etid: error: {data['error']}"])
-
-
 def test_verbose_says_on_stderr_what_is_done(run, study_file, tmp_path):
     status, printed, said = run("--verbose", "fit", study_file, "-o", tmp_path / "fits.h5")
     assert status == DONE
@@ -336,13 +326,14 @@ def test_verbose_says_on_stderr_what_is_done(run, study_file, tmp_path):
     assert again == (DONE, printed, [])
 
 
-@pytest.mark.parametrize("command", cli.COMMANDS)
-def test_every_command_has_a_summary_and_json(run, command):
-    status, printed, complaints = run(command, "--help")
+def test_help_lists_every_command(run):
+    status, listed, complaints = run("--help")
     assert (status, complaints) == (DONE, [])
-    assert any("--json" in line for line in printed)
-    _, listed, _ = run("--help")
-    assert any(re.match(rf" +{command} +[a-z]", line) for line in listed)
+    for command in cli.COMMANDS:
+        assert any(re.match(rf" +{command} +[a-z]", line) for line in listed)
+        status, printed, complaints = run(command, "--help")
+        assert (status, complaints) == (DONE, [])
+        assert any("--json" in line for line in printed)
 
 
 @pytest.mark.parametrize(

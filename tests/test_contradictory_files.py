@@ -1,11 +1,9 @@
 """Files that contradict themselves or are cut off: refused, or taken with a notice."""
 
 import re
-import wave
 
 import numpy as np
 import pytest
-import scipy.io.wavfile
 
 from tests import lab_files
 from tests.lab_files import table
@@ -117,30 +115,3 @@ def test_a_unit_in_the_name_of_a_channel_is_its_unit(tmp_path):
     np.savez(path, skin=V_OUT, **{"open [mV]": V_TH})  # pyright: ignore[reportArgumentType]
     one, _ = imported(path, v_th="open [mV]", **RATE)
     np.testing.assert_allclose(one.v_th, V_TH * 1e-3)
-
-
-def sound(path, kind):
-    """A WAV file of two channels; its samples begin at byte 44, or 58 for float32."""
-    both = np.stack([V_TH, V_OUT], 1) / 10
-    if kind == "24 bits":
-        with wave.open(str(path), "wb") as file:
-            file.setnchannels(2)
-            file.setsampwidth(3)
-            file.setframerate(200_000)
-            file.writeframes(bytes(6 * COUNT))
-    else:
-        codes = both if kind == "float32" else both * 2**15
-        scipy.io.wavfile.write(path, 200_000, codes.astype(kind))
-    return path.read_bytes()
-
-
-@pytest.mark.parametrize("kind", ["int16", "float32", "24 bits"])
-def test_a_wav_file_that_was_cut_off_is_refused_wherever_it_was(kind, tmp_path):
-    path, given = tmp_path / "a.wav", {"v_th": "1", "v_out": "2"}
-    whole = sound(path, kind)
-    for cut in (1, 2, 3, 4, 40, 119):
-        path.write_bytes(whole[:-cut])
-        refused(path, rf"is truncated: its samples end at byte {len(whole)}, the file", **given)
-    text = b"LIST" + (4).to_bytes(4, "little") + b"INFO"
-    path.write_bytes(whole + text)  # as sound editors append it
-    assert imported(path, **given)[0].sample_rate == 200e3

@@ -14,7 +14,7 @@ from etid.files import channel as channels
 from etid.files.channel import parse_unit
 from etid.files.readers import delimited as text_rows
 from etid.recordings.recording import RecordingError
-from tests.lab_files import LINE, abf, imported, matlab, refused, rig, table, tdms
+from tests.lab_files import LINE, abf, imported, matlab, refused, rig, table, tdms, wav
 
 README = pathlib.Path(__file__).parents[1] / "data_schema" / "README.md"
 RNG = np.random.default_rng(6)
@@ -129,8 +129,11 @@ def test_a_linear_scaling_is_applied_once_and_leaves_samples(kind, tmp_path):
     [
         (lambda path: rig(path, V_TH, V_OUT), pair(), (1, 500, 15_900, 16_200)),
         (lambda path: abf(path / "a.abf", [V_TH, V_OUT]), SWEEPS, (100, 600, 4044, 6044)),
+        *(
+            (lambda path, kind=kind: wav(path / "a.wav", kind), columns("1", "2"), (1, 2, 3, 4, 40))
+            for kind in ("int16", "float32", "24 bits")
+        ),
     ],
-    ids=["tdms", "abf"],
 )
 def test_a_file_that_was_cut_off_is_refused_wherever_it_was(make, said, cuts, tmp_path):
     path = make(tmp_path)
@@ -138,6 +141,8 @@ def test_a_file_that_was_cut_off_is_refused_wherever_it_was(make, said, cuts, tm
     for cut in cuts:
         path.write_bytes(whole[:-cut])
         refused(path, said, "is truncated: .* ends? at byte|cannot be read")
+    path.write_bytes(whole)
+    assert len(imported(path, said)[0]) == 1
 
 
 # MATLAB

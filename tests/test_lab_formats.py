@@ -34,6 +34,13 @@ def imported(path, **given):
     return list(recordings.values()), used
 
 
+def of_arrays(folder, arrays, **given):
+    """The recordings of an npz file of the channels `th`, `out` and others."""
+    np.savez(folder / "a.npz", **arrays)
+    told = {"v_th": "th", "v_out": "out", "sample_rate": RATE, **given}
+    return imported(folder / "a.npz", **told)
+
+
 @pytest.mark.parametrize("kind", [np.int16, np.int32, np.uint8, np.float32])
 def test_a_wav_file_holds_fractions_of_full_scale(kind, tmp_path):
     th, out = pulses()
@@ -42,6 +49,8 @@ def test_a_wav_file_holds_fractions_of_full_scale(kind, tmp_path):
     middle = 128 if kind is np.uint8 else 0
     codes = (both * full + middle).round(0 if full > 1 else 9).astype(kind)
     scipy.io.wavfile.write(tmp_path / "a.wav", int(RATE), codes)
+    with (tmp_path / "a.wav").open("ab") as file:
+        file.write(b"LIST" + (4).to_bytes(4, "little") + b"INFO")  # as sound editors append it
     [recording], [used] = imported(tmp_path / "a.wav", v_th="1", v_out="2", scale=0.01)
     assert (recording.sample_rate, used.rate_by) == (RATE, "file")
     np.testing.assert_allclose(recording.v_th, th, atol=100 / full if full > 1 else 1e-5)
@@ -87,23 +96,22 @@ def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
 
 def test_arrays_of_an_npz_file_are_channels(tmp_path):
     th, out = pulses()
-    np.savez(tmp_path / "a.npz", open=th, finger=np.stack([out, out / 2]), note=np.array("text"))
-    recordings, _ = imported(tmp_path / "a.npz", v_th="open", v_out="finger", sample_rate=RATE)
+    arrays = {"open": th, "finger": np.stack([out, out / 2]), "note": np.array("text")}
+    recordings, _ = of_arrays(tmp_path, arrays, v_th="open", v_out="finger")
     assert [one.path for one in recordings] == ["loaded/0", "loaded/1"]
     np.testing.assert_array_equal(recordings[1].v_out, out / 2)
     np.testing.assert_array_equal(recordings[1].v_th, th)
-    with pytest.raises(RecordingError, match="the names are 'open', 'finger', 'note'"):
-        imported(tmp_path / "a.npz", v_th="opn", v_out="finger", sample_rate=RATE)
-    with pytest.raises(RecordingError, match="must be an array of real numbers"):
-        imported(tmp_path / "a.npz", v_th="note", v_out="finger", sample_rate=RATE)
+    for name, message in (
+        ("opn", "the names are 'open', 'finger', 'note'"),
+        ("note", "must be an array of real numbers"),
+    ):
+        with pytest.raises(RecordingError, match=message):
+            of_arrays(tmp_path, arrays, v_th=name, v_out="finger")
 
 
 def test_a_long_record_is_split_at_its_pauses(tmp_path):
     th, out = long_record()
-    np.savez(tmp_path / "a.npz", th=th, out=out)
-    recordings, [used] = imported(
-        tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="pulses"
-    )
+    recordings, [used] = of_arrays(tmp_path, {"th": th, "out": out}, split="pulses")
     assert [one.trial for one in recordings] == ["0", "1", "2"]
     assert [round(one.periods, 2) for one in recordings] == [4, 6, 5]
     assert used.paths == ("loaded/0", "loaded/1", "loaded/2")
@@ -135,8 +143,7 @@ def in_turn(rests=(2000, 2000)):
     ],
 )
 def test_electrodes_that_fire_in_turn_become_recordings_of_each(tmp_path, given):
-    np.savez(tmp_path / "a.npz", **in_turn())
-    recordings, _ = imported(tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, **given)
+    recordings, _ = of_arrays(tmp_path, in_turn(), **given)
     found = {one.path: (one.electrode, one.trial) for one in recordings}
     assert found == {f"loaded/{e}/{n}": (e, n) for e in ("E7", "E12") for n in ("0", "1")}
     for one in recordings:
@@ -148,41 +155,33 @@ def test_electrodes_that_fire_in_turn_become_recordings_of_each(tmp_path, given)
 def test_electrodes_may_fire_without_a_pause(tmp_path):
     th = np.concatenate([pulses(6)[0], np.zeros(500)])
     which = np.where(np.arange(th.size) < 3 * PERIOD, 1.0, 2.0)
-    out = th / 2
-    np.savez(tmp_path / "a.npz", th=th, out=out, which=which)
-    recordings, _ = imported(
-        tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="which",
-        electrode="E{which}",
-    )  # fmt: skip
+    arrays = {"th": th, "out": th / 2, "which": which}
+    recordings, _ = of_arrays(tmp_path, arrays, split="which", electrode="E{which}")
     assert [one.electrode for one in recordings] == ["E1", "E2"]
     assert [round(one.periods, 1) for one in recordings] == [3, 3]
 
 
 @pytest.mark.parametrize(
-    ("rests", "given", "message"),
+    ("given", "message"),
     [
-        ((2000, 2000), {"electrode": ["E7", "E12"]}, "the list .*Give split too"),
-        ((2000, 2000), {"split": "pulses", "electrode": []}, "is the list"),
-        (
-            (2000, 2000),
-            {"split": "pulses", "electrode": ["E1", "E2", "E3"]},
-            "names 3 electrodes, but the record has 4 trains",
-        ),
-        ((0, 0), {"split": "pulses", "electrode": ["E7", "E12"]}, "cuts the first or the last"),
-        ((2000, 2000), {"split": "tilted", "electrode": "{tilted}"}, "is 3.75 at sample"),
-        ((2000, 2000), {"split": "what", "electrode": "E{what}"}, "there is no 'what'"),
-        (
-            (2000, 2000),
-            {"split": "which", "electrode": "E{which}", "trial": 3},
-            "1 labels for 4 trials",
-        ),
+        ({"electrode": ["E7", "E12"]}, "the list .*Give split too"),
+        ({"split": "pulses", "electrode": []}, "is the list"),
+        ({"split": "pulses", "electrode": ["E1", "E2", "E3"]},
+         "names 3 electrodes, but the record has 4 trains"),
+        ({"split": "pulses", "electrode": ["E7", "E12"], "rests": (0, 0)},
+         "cuts the first or the last"),
+        ({"split": "tilted", "electrode": "{tilted}"}, "is 3.75 at sample"),
+        ({"split": "what", "electrode": "E{what}"}, "there is no 'what'"),
+        ({"split": "which", "electrode": "E{which}", "trial": 3}, "1 labels for 4 trials"),
+        ({"split": "pulses", "v_out": "stack"}, "can be split"),
     ],
-)
-def test_refusals_of_electrodes_in_turn(tmp_path, rests, given, message):
-    held = in_turn(rests)
-    np.savez(tmp_path / "a.npz", **held, tilted=held["which"] / 2 + 0.25)
+)  # fmt: skip
+def test_refusals_of_a_record_that_is_split(tmp_path, given, message):
+    given = {"rests": (2000, 2000), **given}
+    held = in_turn(given.pop("rests"))
+    more = {"tilted": held["which"] / 2 + 0.25, "stack": np.stack([held["out"]] * 2)}
     with pytest.raises(RecordingError, match=message):
-        imported(tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, **given)
+        of_arrays(tmp_path, {**held, **more}, **given)
 
 
 def test_a_long_record_is_split_at_the_edges_of_a_trigger(tmp_path):
@@ -190,27 +189,22 @@ def test_a_long_record_is_split_at_the_edges_of_a_trigger(tmp_path):
     trigger = np.zeros(th.size)
     for start in (1900, 1900 + 3600, 1900 + 7300):  # before the trains, which begin with a rest
         trigger[start : start + 50] = 5.0
-    np.savez(tmp_path / "a.npz", th=th, out=out, trig=trigger)
-    recordings, _ = imported(
-        tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="trig"
-    )
+    recordings, _ = of_arrays(tmp_path, {"th": th, "out": out, "trig": trigger}, split="trig")
     whole = etid.Recording(th, out, sample_rate=RATE, pulse_rate=PULSES)
     # As by the pauses: a trial has whole periods, without the pause after them.
     for one, by_edge, by_pause in zip(recordings, whole.split(trigger), whole.split(), strict=True):
         np.testing.assert_array_equal(one.v_th, by_pause.v_th)
         np.testing.assert_array_equal(by_edge.v_th, by_pause.v_th)
         assert by_edge.path == by_pause.path
-    with pytest.raises(RecordingError, match="no rising edge"):
-        whole.split(np.zeros(th.size))
-    with pytest.raises(RecordingError, match=r"has shape \(5,\), must be"):
-        whole.split(np.zeros(5))
-    with pytest.raises(RecordingError, match="no pulse follows a rising edge"):
-        whole.split(np.arange(th.size) > th.size - 100)
+    for wrong, message in (
+        (np.zeros(th.size), "no rising edge"),
+        (np.zeros(5), r"has shape \(5,\), must be"),
+        (np.arange(th.size) > th.size - 100, "no pulse follows a rising edge"),
+    ):
+        with pytest.raises(RecordingError, match=message):
+            whole.split(wrong)
     with pytest.raises(RecordingError, match="without a pause"):
         etid.Recording(*pulses(), sample_rate=RATE, pulse_rate=PULSES).split()
-    np.savez(tmp_path / "b.npz", th=th, out=np.stack([out, out]))
-    with pytest.raises(RecordingError, match="can be split"):
-        imported(tmp_path / "b.npz", v_th="th", v_out="out", sample_rate=RATE, split="pulses")
 
 
 def test_arrays_become_a_study():
