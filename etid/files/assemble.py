@@ -124,8 +124,7 @@ def sources_of(
         )
     parts, electrodes = _parts(plan, channels, channel, common)
     several = stacked or bool(parts)
-    trials = list(range(len(parts))) if parts else trials
-    if electrodes:  # the trials are the rounds of each
+    if parts:  # the trials are the rounds of each electrode
         trials = [electrodes[:i].count(one) for i, one in enumerate(electrodes)]
     labels = _labels(plan.fields.get("trial"), trials, several)
     sources: dict[str, AbstractSource] = {}
@@ -140,11 +139,11 @@ def sources_of(
                     layout.append(_layout(name, part, factors[name]))
                 records[name] = part, trial
         path = f"{plan.path}/{index}" if several or plan.path in KINDS else plan.path
-        own = {"trial": label, "path": path}
-        if electrodes:
+        own = {"trial": label}
+        if parts and electrodes[index]:
             own["electrode"] = electrodes[index]
-            own["path"] = path = f"{plan.path}/{electrodes[index]}/{trials[index]}"
-        metadata = metadata_from(**{**vars(common), **own})
+            path = f"{plan.path}/{electrodes[index]}/{trials[index]}"
+        metadata = metadata_from(**{**vars(common), **own, "path": path})
         th = records.get("v_th")
         unloaded = (file, path) if th is None else (file, th[0].name, th[1])
         sources[path] = _Source(tuple(layout), unloaded, file, metadata, records)
@@ -174,9 +173,9 @@ def _parts(
     channel: Callable[[str], Channel],
     common: Metadata,
 ) -> tuple[list[slice], list[str]]:
-    """The parts of one long record, and their electrodes if these fire in turn.
+    """The parts of one long record, and the electrode of each, which is empty if all are of one.
 
-    Both are empty if the record is not to be split.
+    Both lists are empty if the record is not to be split.
     """
     if not plan.split:
         return [], []
@@ -215,7 +214,7 @@ def _parts(
             field="electrode",
             remedy="Name them in the order in which they fire, and record whole rounds",
         )
-    return parts, [order[i % len(order)] for i in range(len(parts))] if order else []
+    return parts, [order[i % len(order)] if order else "" for i in range(len(parts))]
 
 
 def _used(name: str, signal: Signal, said: str, by: str) -> tuple[Used, float]:
