@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import pytest
@@ -168,6 +169,76 @@ def test_a_wrong_table_is_explained(text, changes, message, tmp_path):
     path = tmp_path / "t.csv"
     path.write_bytes(text.encode("latin-1"))
     lab_files.refused(path, None, message, **{**TABLE, **changes})
+
+
+BARE = {**TABLE, "scale": 1.0}
+COUNT = 30
+V_TH = np.round(np.random.default_rng(8).normal(size=COUNT), 3)
+V_OUT = V_TH / 2
+
+
+def rows(sign=".", between=",", end=""):
+    """Times, V_th and V_out in text."""
+    lines = [
+        between.join(f"{x:.6f}".replace(".", sign) for x in (i * 5e-6, a, b)) + end
+        for i, (a, b) in enumerate(zip(V_TH, V_OUT, strict=True))
+    ]
+    return [f"{line}\n" for line in lines]
+
+
+def noticed(path, **given):
+    """The recording of a file, and the notices."""
+    recordings, [used] = lab_files.imported(path, **{**BARE, **given})
+    return recordings["loaded/0"], used.notices
+
+
+def refused(path, message, **given):
+    assert lab_files.refused(path, None, message, **{**BARE, **given}).remedy
+
+
+def test_notes_quotes_and_delimiters_at_the_end_are_no_fault(tmp_path):
+    ends = ["\n", ",\n", ",fine\n", ',"fine, though"\n', ",,\n"]
+    lines = [line[:-1] + ends[i % len(ends)] for i, line in enumerate(rows())]
+    lines = [re.sub(r"^([^,]*)", r'"\1"', line) if i % 3 else line for i, line in enumerate(lines)]
+    one, notices = noticed(
+        lab_files.table(tmp_path, "t,th,out,note\n" + "".join(lines)), time="t", sample_rate=None
+    )
+    np.testing.assert_array_equal(one.v_th, V_TH)
+    np.testing.assert_allclose(one.v_out, V_OUT, rtol=0, atol=1e-12)
+    assert notices == ()
+
+
+@pytest.mark.parametrize(("sign", "between", "end"), [(".", ",", ""), (",", ";", ";")])
+def test_a_table_that_ends_inside_a_number_is_taken_with_a_notice(sign, between, end, tmp_path):
+    told = {} if sign == "." else {"delimiter": between, "decimal": sign}
+    text = between.join(["t", "th", "out"]) + end + "\n" + "".join(rows(sign, between, end))
+    whole = text.rstrip(end + "\n")
+    for shown in (text, whole):  # a line break is often missing
+        assert noticed(lab_files.table(tmp_path, shown), **told)[1] == ()
+    one, [notice] = noticed(lab_files.table(tmp_path, whole[:-4]), **told)
+    last = whole[:-4].rpartition(between)[2]
+    assert notice.startswith(f"the last number, '{last}', is shorter than those above")
+    assert one.v_out[-1] == float(last.replace(",", "."))
+    refused_end = whole.rpartition(between)[0]
+    refused(lab_files.table(tmp_path, refused_end), "has 2 cells; the table has", **told)
+
+
+def test_the_preamble_of_an_oscilloscope_is_compared_with_its_table(tmp_path):
+    body = "t [s],th [V],out [V]\n" + "".join(rows())
+
+    def scope(length, interval):
+        said = f"Model,DPO\nRecord Length,{length}\nSample Interval,{interval}\n"
+        return lab_files.table(tmp_path, said + body)
+
+    told: dict = {"time": "t", "header_line": 4, "sample_rate": None}
+    assert noticed(scope(30, "5e-06,s"), **told)[1] == ()
+    assert noticed(scope("3.0e+01", "5,us"), **told)[1] == ()
+    without, _ = noticed(scope(30, "5e-06"), header_line=4, sample_rate=None)
+    assert without.sample_rate == 200e3
+    _, [used] = lab_files.imported(scope(40, "5e-06"), **{**BARE, **told})
+    notice = "the table has 30 rows, its preamble declares 40 samples"
+    assert str(used).endswith(f"\n  note: {notice}")
+    refused(scope(30, "1e-05"), "is 200000 Hz from the time 't', but 100000 Hz from the f", **told)
 
 
 @pytest.mark.parametrize("version", [5, 7.3])

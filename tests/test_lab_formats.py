@@ -7,11 +7,12 @@ import scipy.io.wavfile
 import etid
 from etid import RecordingError
 from tests import lab_files
-from tests.lab_files import labview
+from tests.lab_files import labview, refused
 
 RATE, PULSES = 20e3, 60.0
 PERIOD = RATE / PULSES
 FIELDS = {"pulse_rate": PULSES, "scale": 1.0}
+NAMES = {"v_th": "open", "v_out": "skin"}
 
 
 def pulses(periods=6, before=0):
@@ -57,22 +58,54 @@ def test_a_wav_file_holds_fractions_of_full_scale(kind, tmp_path):
     np.testing.assert_allclose(recording.v_out, out, atol=100 / full if full > 1 else 1e-5)
 
 
+def virtual(path, times=None, step=1 / RATE, **said):
+    """A LabVIEW file of pulses."""
+    times = [f"{i / RATE:.6f}" for i in range(2000)] if times is None else times
+    return labview(path / "a.lvm", times, *pulses(), step=f"{step:.6E}", **said)
+
+
 @pytest.mark.parametrize(
     ("separator", "decimal", "columns"),
     [("Tab", ".", "One"), ("Tab", ",", "No"), ("Comma", ".", "One")],
 )
 def test_a_labview_file_says_how_it_is_written(separator, decimal, columns, tmp_path):
     th, out = pulses()
-    times = ["" if columns == "No" else f"{i / RATE:.6f}" for i in range(th.size)]
-    path = labview(
-        tmp_path / "a.lvm", times, th, 1e3 * out, step=f"{1 / RATE:.6E}", separator=separator,
+    path = virtual(
+        tmp_path, [""] * 2000 if columns == "No" else None, separator=separator,
         decimal=decimal, columns=columns, unit="mV",
     )  # fmt: skip
-    [recording], [used] = imported(path, v_th="open", v_out="skin")
-    np.testing.assert_allclose(recording.v_out, out, atol=1e-6)
+    [recording], [used] = imported(path, **NAMES)
+    np.testing.assert_allclose(recording.v_out, out / 1e3, atol=1e-9)
     np.testing.assert_allclose(recording.v_th, th, atol=1e-6)
     assert recording.sample_rate == RATE
     assert str(used.signals["v_out"]) == "'skin' in mV (file)"
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"count": 2001}, "'open' has 2000 samples, the file declares 2001"),
+        ({"step": 2 / RATE}, "Delta_X: is 0.0001 s, but the column of times has steps of 5e-05 s"),
+        ({"step": 0.5 / RATE}, "Delta_X: is 2.5e-05 s, but the column of times has steps"),
+        ({"name": "open [mV]"}, r"v_th: the file says 'Volts' and 'mV' of channel 'open \[mV\]'"),
+    ],
+)
+def test_a_labview_file_that_contradicts_itself_is_refused(said, message, tmp_path):
+    names = {**NAMES, "v_th": said.get("name", "open")}
+    assert refused(virtual(tmp_path, **said), None, message, **names, **FIELDS).remedy
+
+
+def test_a_labview_file_may_have_coarse_times_more_samples_and_a_cut_end(tmp_path):
+    coarse = [f"{i / RATE:.4f}" for i in range(2000)]
+    again = [f"{i % 500 / RATE:.6f}" for i in range(2000)]  # appended three times
+    for times in ([""] * 2000, coarse, again):
+        assert imported(virtual(tmp_path, times), **NAMES)[0][0].sample_rate == RATE
+    # LabVIEW appends to a file without changing its header.
+    [one], _ = imported(virtual(tmp_path, count=10), **NAMES)
+    np.testing.assert_array_equal(one.v_th, pulses()[0])
+    path = virtual(tmp_path)
+    path.write_text(path.read_text()[:-5])
+    assert "the last number" in imported(path, **NAMES)[1][0].notices[0]
 
 
 def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
@@ -97,12 +130,13 @@ def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
 def test_arrays_of_an_npz_file_are_channels(tmp_path):
     th, out = pulses()
     arrays = {"open": th, "finger": np.stack([out, out / 2]), "note": np.array("text")}
-    recordings, _ = of_arrays(tmp_path, arrays, v_th="open", v_out="finger")
+    arrays["mV [mV]"] = 1e3 * th
+    recordings, _ = of_arrays(tmp_path, arrays, v_th="mV [mV]", v_out="finger")
     assert [one.path for one in recordings] == ["loaded/0", "loaded/1"]
     np.testing.assert_array_equal(recordings[1].v_out, out / 2)
-    np.testing.assert_array_equal(recordings[1].v_th, th)
+    np.testing.assert_allclose(recordings[1].v_th, th)
     for name, message in (
-        ("opn", "the names are 'open', 'finger', 'note'"),
+        ("opn", "the names are 'open', 'finger', 'note', "),
         ("note", "must be an array of real numbers"),
     ):
         with pytest.raises(RecordingError, match=message):
