@@ -166,12 +166,7 @@ def parser(wanted: Iterable[str] = COMMANDS) -> argparse.ArgumentParser:
     parser.add_argument(
         "--verbose", action="store_true", help="say on stderr what is done to each recording"
     )
-    of = importlib.metadata.version
-    versions = f"etid {etid.__version__}, JAX {of('jax')}, NumPy {np.__version__}"
-    machine = f"Python {platform.python_version()}, {platform.machine()}"
-    parser.add_argument(
-        "--version", action="version", version=f"{versions}, {machine}", help="print versions"
-    )
+    parser.add_argument("--version", action=_Version, help="print versions")
     parser.add_argument(
         "--completion",
         action=_Completion,
@@ -202,6 +197,19 @@ def _module(name: str) -> Any:
     jax.config.update("jax_enable_x64", True)
     _keep_programs(jax.config)
     return importlib.import_module(f"etid.commands.{name}")
+
+
+class _Version(argparse.Action):
+    """Print the versions for a bug report, and exit."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(nargs=0, **options)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        of = importlib.metadata.version  # it searches folders, so not at every start
+        versions = f"etid {etid.__version__}, JAX {of('jax')}, NumPy {np.__version__}"
+        print(f"{versions}, Python {platform.python_version()}, {platform.machine()}")
+        parser.exit()
 
 
 class _Completion(argparse.Action):

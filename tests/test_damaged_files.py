@@ -167,6 +167,7 @@ def test_a_damaged_chunk_costs_its_own_recording(texts):
     with etid.read(texts) as study:
         codes = study["s02/dry"].samples["v_out"].stored
     offset = stored_again(texts, data=codes, chunks=codes.shape, fletcher32=True)
+    assert offset is not None
     with texts.open("r+b") as raw:
         raw.seek(offset + 50)
         raw.write(b"\xff\x00\xff")
