@@ -40,6 +40,14 @@ def sweep(number):
 SWEEPS = {**GIVEN, "v_th": sweep(0), "v_out": sweep(1)}  # both records in one channel
 
 
+@pytest.fixture(params=["at once", "in parts"])
+def parts(request, monkeypatch):
+    """Records of a thousand samples are read at once, and in 143 parts."""
+    if request.param == "in parts":
+        monkeypatch.setattr(channels, "BLOCK", 7)
+        monkeypatch.setattr(text_rows, "ROWS", 13)
+
+
 # What the README of the schema shows
 
 
@@ -66,7 +74,7 @@ def test_the_csv_of_the_readme_is_imported_by_its_mapping(tmp_path):
 
 
 @pytest.mark.parametrize("version", [5, 7.3])
-def test_the_matlab_file_of_the_readme_is_imported_by_its_mapping(version, tmp_path):
+def test_the_matlab_file_of_the_readme_is_imported_by_its_mapping(version, parts, tmp_path):
     trials = np.stack([V_OUT, V_OUT / 2, V_OUT / 3])
     known, dry = {"open": V_TH, "loaded": V_OUT}, {"open": V_TH, "skin": trials}
     path = matlab(tmp_path / "session.mat", version, known=known, dry=dry)
@@ -80,7 +88,7 @@ def test_the_matlab_file_of_the_readme_is_imported_by_its_mapping(version, tmp_p
         np.testing.assert_allclose(one.v_th, V_TH / 0.0535, rtol=1e-15)
 
 
-def test_the_tdms_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
+def test_the_tdms_file_of_the_readme_is_imported_by_its_mapping(parts, tmp_path):
     names = ("known/open", "known/loaded", "s01 dry/open", "s01 dry/skin", "s01 dry/shunt")
     signals = {name: (V_TH * number, {}) for number, name in enumerate(names, 1)}
     path = tdms(tmp_path / "s.tdms", signals, unit_string="Volts", wf_increment=5e-6)
@@ -93,7 +101,7 @@ def test_the_tdms_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
     assert str(used[1].signals["current"]) == "'s01 dry/shunt' in Volts (file), divided by 100"
 
 
-def test_the_abf_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
+def test_the_abf_file_of_the_readme_is_imported_by_its_mapping(parts, tmp_path):
     sweeps = np.stack([V_TH, V_OUT, V_OUT / 2])
     recordings, _ = imported(abf(tmp_path / "cell.abf", sweeps, unit="mV"), example("ABF"))
     assert list(recordings) == ["s01/dry/0", "s01/dry/1"]
@@ -235,49 +243,20 @@ def test_v_th_may_be_a_channel_of_another_file(tmp_path, monkeypatch):
         etid.import_file(finger, "t.h5", told)
 
 
-# Parts
-
-
-@pytest.fixture
-def small_parts(monkeypatch):
-    """Records of a thousand samples are read in 143 parts."""
-    monkeypatch.setattr(channels, "BLOCK", 7)
-    monkeypatch.setattr(text_rows, "ROWS", 13)
-
-
-@pytest.mark.parametrize("format", ["csv", "mat", "tdms", "abf"])
-def test_what_is_read_in_parts_is_what_is_read_at_once(format, small_parts, tmp_path):
-    if format == "csv":
-        path = tmp_path / "a.csv"
-        rows = np.column_stack([np.arange(1000) / 2e5, V_TH, V_OUT])
-        np.savetxt(path, rows, "%.17g", ",", header="t [s],open,skin", comments="")
-        said = columns("open", "skin", time={"channel": "t"})
-    elif format == "mat":
-        path = matlab(tmp_path / "a.mat", 7.3, open=V_TH, skin=np.stack([V_TH, V_OUT]))
-        said = columns("open", "skin", sample_rate=2e5)
-        said["v_out"]["rows"] = 1
-    elif format == "tdms":
-        path, said = rig(tmp_path, V_TH, V_OUT), pair()
-    else:
-        path, said = abf(tmp_path / "a.abf", [V_TH, V_OUT]), SWEEPS
-    recordings, _ = imported(path, said)
-    one = next(iter(recordings.values()))
-    step = one.samples["v_out"].resolution or 0.0
-    np.testing.assert_allclose(one.v_out, V_OUT / 0.0535, rtol=1e-14, atol=1.001 * step)
-    np.testing.assert_allclose(one.v_th, V_TH / 0.0535, rtol=1e-14, atol=1.001 * step)
-    assert one.sample_rate == pytest.approx(200e3, rel=1e-12)
-    assert [*tmp_path.iterdir()] == [path]
-
-
-def test_time_stamps_are_checked_in_every_part(small_parts, tmp_path):
-    path = tmp_path / "t.csv"
-    times = np.arange(1000) / 2e5
-    for wrong in (300, 999):
+def test_numbers_and_time_stamps_of_a_table_are_checked_in_every_part(parts, tmp_path):
+    times, path = np.arange(1000) / 2e5, tmp_path / "t.csv"
+    said = pair("open", "skin", time={"channel": "t"})
+    for wrong in (300, 999, 1000):
         stamps = np.where(np.arange(1000) >= wrong, times + 3e-6, times)
         rows = np.column_stack([stamps, V_TH, V_OUT])
         np.savetxt(path, rows, "%.17g", ",", header="t [s],open [V],skin [V]", comments="")
-        said = pair("open", "skin", time={"channel": "t"})
-        refused(path, said, r"time: is not uniform: sample \d+")
+        if wrong < 1000:
+            refused(path, said, r"time: is not uniform: sample \d+")
+    one = imported(path, said)[0]["loaded/0"]
+    np.testing.assert_allclose(one.v_out, V_OUT / 0.0535, rtol=1e-14)
+    np.testing.assert_allclose(one.v_th, V_TH / 0.0535, rtol=1e-14)
+    assert one.sample_rate == pytest.approx(200e3, rel=1e-12)
+    assert [*tmp_path.iterdir()] == [path]
 
 
 # For all

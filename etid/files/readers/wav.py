@@ -28,7 +28,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
             rate, samples = scipy.io.wavfile.read(path, mmap=True)
         except ValueError:
             rate, samples = scipy.io.wavfile.read(path)  # 24 bits
-    columns = samples.reshape(samples.shape[0], -1)
+    columns = samples if samples.ndim == 2 else samples[:, None]
     names = tuple(str(number + 1) for number in range(columns.shape[1]))
 
     def channel(name: str) -> Channel:
