@@ -10,6 +10,7 @@ import struct
 import warnings
 from collections.abc import Iterator
 
+import numpy as np
 import scipy.io.wavfile
 
 from etid.files.channel import Channel, Contents, array_channel
@@ -28,7 +29,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
             rate, samples = scipy.io.wavfile.read(path, mmap=True)
         except ValueError:
             rate, samples = scipy.io.wavfile.read(path)  # 24 bits
-    columns = samples if samples.ndim == 2 else samples[:, None]
+    columns = np.atleast_2d(samples.T).T  # (time, channel)
     names = tuple(str(number + 1) for number in range(columns.shape[1]))
 
     def channel(name: str) -> Channel:
