@@ -269,7 +269,6 @@ def _matlab73(folder: pathlib.Path) -> bytes:
 
 
 def _matlab5() -> bytes:
-    import pymatreader  # noqa: F401  # without it such a file cannot be read
     import scipy.io
 
     buffer = io.BytesIO()

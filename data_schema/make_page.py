@@ -104,7 +104,7 @@ in `loaded/finger`.
 | file | channels | the file contains | trials | install |
 |---|---|---|---|---|
 | `.csv` | columns, by the first line | units: `open [mV]`, or a second line of them | none | |
-| `.mat` | variables, `a.b` for field b of structure a | nothing | rows | `etid[matlab]` |
+| `.mat` | variables, `a.b` for field b of structure a | nothing | rows | |
 | `.tdms` | `group/channel` | units (`unit_string`), rate (`wf_increment`) | none | `etid[tdms]` |
 | `.abf` | ADC channels, or `channel 0`, … | units and rate | sweeps | `etid[abf]` |
 | `.npz` | arrays | nothing | rows | |
@@ -116,8 +116,8 @@ A table contains its rate if a preamble of an oscilloscope has a `Sample Interva
 name such as `open [mV]` contains a unit.
 
 The import keeps only a part of a record in memory. MATLAB files before version 7.3, `.npz` files
-and records that are split are the exceptions; only the first need `etid[matlab]`. Integer codes
-stay integers if a straight line converts them to volts.
+and records that are split are the exceptions. Integer codes stay integers if a straight line
+converts them to volts.
 
 A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Keys above the first
 `[[recording]]` hold for all of them. The keys are:

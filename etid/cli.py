@@ -83,15 +83,15 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
     """
     arguments = commands.parse_args(words)
     source = getattr(arguments, "source", [])
-    if any(_same_file(one, arguments.target) for one in np.ravel([source])):
+    read = [one for one in np.ravel([source]) if one.exists()]
+    if any(arguments.target.exists() and one.samefile(arguments.target) for one in read):
         commands.error(f"{arguments.target} is the file to read; name another file to write")
-    from etid.commands.outputs import check_outputs
     from etid.recordings.errors import RecordingError
     from etid.results.fit import IdentificationError
 
     try:
         if "force" in arguments:
-            check_outputs(arguments.module.outputs(arguments), force=arguments.force)
+            _check_outputs(arguments.module.outputs(arguments), force=arguments.force)
         with _logged() if arguments.verbose else contextlib.nullcontext():
             outcome = arguments.module.run(arguments)
     except (RecordingError, IdentificationError, ValueError, OSError) as error:
@@ -106,6 +106,28 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
         data = {"command": arguments.command, "status": outcome.status, **outcome.data}
         text = json.dumps(_plain(data), ensure_ascii=False, allow_nan=False)
     return max(outcome.status, _print(text))
+
+
+def _check_outputs(outputs: Mapping[pathlib.Path, tuple[str, ...]], *, force: bool) -> None:
+    """Raise an error if a file cannot be written, or would be overwritten.
+
+    Args:
+        outputs: The endings that the name of each file may have. A name without the ending of a
+            known format is always right.
+        force: Whether existing files may be replaced.
+    """
+    from etid.recordings.replacing import check_ending
+
+    for path, endings in outputs.items():
+        if path.is_dir():
+            raise ValueError(f"{path}: this is a folder; name a file")
+        if path.exists() and not path.is_file():  # it would be replaced
+            raise ValueError(f"{path}: this is a device or a pipe; name a file")
+        if not path.absolute().parent.is_dir():
+            raise ValueError(f"{path}: the folder of this file does not exist")
+        check_ending(path, endings)
+        if path.exists() and not force:
+            raise ValueError(f"{path}: this file exists; add --force to replace it")
 
 
 @contextlib.contextmanager
@@ -184,7 +206,7 @@ class _Version(argparse.Action):
         super().__init__(nargs=0, **options)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        of = importlib.metadata.version
+        of = importlib.metadata.version  # it searches folders, so not at every start
         versions = f"etid {etid.__version__}, JAX {of('jax')}, NumPy {np.__version__}"
         print(f"{versions}, Python {platform.python_version()}, {platform.machine()}")
         parser.exit()
@@ -251,10 +273,6 @@ def _keep_programs(config: Any) -> None:
     if os.access(folder, os.W_OK):
         config.update("jax_compilation_cache_dir", str(folder))
         config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
-def _same_file(source: pathlib.Path, target: pathlib.Path) -> bool:
-    return source.exists() and target.exists() and source.samefile(target)
 
 
 def _plain(value: Any) -> Any:

@@ -1,9 +1,12 @@
 """Files as instruments write them, made by the libraries that read them; and their import."""
 
+import wave
+
 import h5py
 import numpy as np
 import pytest
 import scipy.io
+import scipy.io.wavfile
 from nptdms import ChannelObject, TdmsWriter
 from pyabf.abfWriter import writeABF1
 
@@ -21,7 +24,9 @@ def imported(source, mapping=None, **given):
     used = etid.import_file(source, target, mapping, **given)
     assert hdf5.check(target) == []
     with hdf5.read(target) as study:
-        return dict(study), used
+        found = dict(study)
+    target.unlink()
+    return found, used
 
 
 def refused(source, mapping, message, **given):
@@ -97,6 +102,17 @@ def tdms(path, channels, **properties):
 def abf(path, sweeps, sample_rate=200e3, unit="V"):
     """An ABF file of one channel without a name."""
     writeABF1(np.asarray(sweeps, float), str(path), sample_rate, unit)
+    return path
+
+
+def wav(path, kind):
+    """A WAV file of two channels of 30 samples at 200 kHz."""
+    if kind == "24 bits":
+        with wave.open(str(path), "wb") as file:
+            file.setparams((2, 3, 200_000, 30, "NONE", ""))
+            file.writeframes(bytes(6 * 30))
+    else:
+        scipy.io.wavfile.write(path, 200_000, np.arange(60).reshape(30, 2).astype(kind))
     return path
 
 

@@ -62,6 +62,16 @@ def without_driver(tmp_path_factory):
     return path
 
 
+def as_json(printed):
+    """The one object that stands on stdout; NaN and Infinity are no JSON."""
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    (line,) = printed
+    return json.loads(line, parse_constant=refuse)
+
+
 def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_path):
     files = [tmp_path / name for name in ("a.h5", "b.h5", "c.h5")]
     for file, seed in zip(files, (1, 1, 2), strict=True):
@@ -88,13 +98,9 @@ def test_check_names_every_wrong_field(run, study_file):
         del file["typical/dry/03/v_out"]
     status, printed, _ = run("check", study_file)
     assert status == WRONG_DATA
-    for path, field in (
-        ("calibration/98k8", "v_th.unit"),
-        ("typical/dry/01", "sample_rate"),
-        ("typical/dry/02", "v_out"),  # the NaN
-        ("typical/dry/03", "v_out"),
-    ):
-        assert any(path in line and field in line for line in printed), (path, field)
+    assert printed == [str(problem) for problem in etid.check(study_file)]
+    assert len(printed) == 4
+    assert any("'typical/dry/02', v_out: 1 of 10000" in line for line in printed)  # the NaN
 
 
 def test_check_names_a_constant_current_and_remarks_on_an_implausible_one(run, tmp_path):
@@ -157,8 +163,26 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     assert any(line.startswith("typical/dry/02: nonfinite_samples. ") for line in printed)
     fits = etid.Fits.read(target)
     assert fits.labels["path"].tolist() == [f"typical/dry/{i:02d}" for i in (1, 2, 3, 4, 99)]
-    assert fits.counts() == {"successful": 3, "nonfinite_samples": 1, "unreadable": 1}
     assert "typical/dry/99" in fits.notes[-1]
+
+    _, printed, _ = run("fit", study_file, "-o", target, "--json", "--force")
+    data = as_json(printed)
+    files = {"source": str(study_file), "target": str(target)}
+    assert data.items() >= {"command": "fit", "status": DONE, "recordings": 5, **files}.items()
+    assert data["method"] == "maximum_likelihood"
+    assert data["units"] == {"r_s": "ohm", "r_p": "ohm", "c_p": "farad"}
+    expected = {"successful": 3, "nonfinite_samples": 1, "unreadable": 1}
+    assert data["verdicts"] == fits.counts() == expected
+    (driver,) = data["drivers"]
+    assert driver["calibrations"] == ["calibration/98k8"]
+    assert (driver["verdict"], driver["order"]) == ("successful", 5)
+    assert 0 < driver["rrse"] < 0.01
+    groups = data["groups"], fits.summary("subject", "condition")
+    told, kept = ([group for group in of if group["subject"]] for of in groups)
+    assert told == kept
+    failed, _ = data["unsuccessful"]
+    assert (failed["path"], failed["verdict"]) == ("typical/dry/02", "nonfinite_samples")
+    assert failed["note"]
 
 
 def test_fit_joint_fits_all_recordings_together(run, study_file, tmp_path, monkeypatch):
@@ -173,10 +197,6 @@ def test_fit_joint_fits_all_recordings_together(run, study_file, tmp_path, monke
     assert asked["order"] == 4
     assert len(printed) > 1
     assert status == DONE
-    options = ("--joint", "--method", "output_error", "--force")
-    status, _, complaints = run("fit", study_file, "-o", tmp_path / "f.h5", *options)
-    assert status == WRONG_DATA
-    assert "--joint uses maximum_likelihood" in complaints[0]
 
 
 def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, without_driver, tmp_path):
@@ -215,6 +235,10 @@ OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
         ("fit study.h5 -o table.csv", "table.csv: the file is not written as .csv; "),
         ("report fits.h5 -o page.pdf", "page.pdf: the file is not written as .pdf; "),
         ("fit study.h5 -o calibration.h5", "this file exists; add --force to replace"),
+        ("fit study.h5 -o f.h5 --joint --method output_error", "--joint uses maximum_likelihood"),
+        ("fit study.h5 -o f.h5 --joint --driver-drift 0.1", "remove --driver-drift"),
+        ("fit study.h5 -o f.h5 --joint --driver d.h5", "remove --driver, or --joint"),
+        ("fit study.h5 -o f.h5 --joint --resume", "--joint is one fit per driver"),
         ("report study.h5", "run etid fit first"),
         ("simulate paper_dry -o s.h5 --jitter 5", "below half a pulse period"),
         ("simulate paper_dry -o s.h5 --jitter -1", "must not be negative"),
@@ -227,10 +251,13 @@ def test_an_error_is_one_line_without_a_traceback(
     (tmp_path / "garbage.h5").write_bytes(b"no HDF5")
     (tmp_path / "table.csv").write_text("open,skin\n1,2\n")
     etid.scenes.paper_calibration().simulate(seed=0).write(tmp_path / "calibration.h5")
-    status, printed, complaints = run(*command.split())
-    assert (status, printed, len(complaints)) == (WRONG_DATA, [], 1)
-    assert complaints[0].startswith("etid: error: ")
-    assert words in complaints[0]
+    status, printed, [complaint] = run(*command.split())
+    assert (status, printed) == (WRONG_DATA, [])
+    assert complaint.startswith("etid: error: ")
+    assert words in complaint
+    status, printed, again = run(*command.split(), "--json")
+    error = {"command": command.split()[0], "status": status, "error": complaint[13:]}
+    assert (again, as_json(printed)) == ([complaint], error)
 
 
 @pytest.mark.parametrize("command", ["fit", "import"])
@@ -240,38 +267,6 @@ def test_the_file_that_is_read_is_never_replaced(run, study_file, command):
     assert status == WRONG_USAGE
     assert "is the file to read; name another file to write" in complaints[-1]
     assert study_file.read_bytes() == before
-
-
-def as_json(printed):
-    """The one object that stands on stdout; NaN and Infinity are no JSON."""
-
-    def refuse(constant):
-        raise AssertionError(f"{constant} is no JSON")
-
-    (line,) = printed
-    return json.loads(line, parse_constant=refuse)
-
-
-def test_json_of_fit_has_what_the_text_has(run, study_file, tmp_path):
-    target = tmp_path / "fits.h5"
-    status, printed, complaints = run("fit", study_file, "-o", target, "--json")
-    assert (status, complaints) == (DONE, [])
-    data = as_json(printed)
-    fits = etid.Fits.read(target)
-    files = {"source": str(study_file), "target": str(target)}
-    assert data.items() >= {"command": "fit", "status": DONE, **files}.items()
-    assert (data["method"], data["recordings"]) == ("maximum_likelihood", 4)
-    assert data["verdicts"] == fits.counts() == {"successful": 3, "nonfinite_samples": 1}
-    (driver,) = data["drivers"]
-    assert driver["calibrations"] == ["calibration/98k8"]
-    assert (driver["verdict"], driver["order"]) == ("successful", 5)
-    assert 0 < driver["rrse"] < 0.01
-    (group,) = data["groups"]
-    assert group == fits.summary("subject", "condition")[0]
-    assert data["units"] == {"r_s": "ohm", "r_p": "ohm", "c_p": "farad"}
-    (failed,) = data["unsuccessful"]
-    assert (failed["path"], failed["verdict"]) == ("typical/dry/02", "nonfinite_samples")
-    assert failed["note"]
 
 
 def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
@@ -317,13 +312,6 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
         assert {key for item in groups for key in item} <= told, command
 
 
-def test_json_of_an_error_is_on_stdout_and_its_line_on_stderr(run):
-    status, printed, complaints = run("fit", "absent.h5", "-o", "fits.h5", "--json")
-    data = as_json(printed)
-    assert status == data["status"] == WRONG_DATA
-    assert (data["command"], complaints) == ("fit", [f"etid: error: {data['error']}"])
-
-
 def test_verbose_says_on_stderr_what_is_done(run, study_file, tmp_path):
     status, printed, said = run("--verbose", "fit", study_file, "-o", tmp_path / "fits.h5")
     assert status == DONE
@@ -336,13 +324,14 @@ def test_verbose_says_on_stderr_what_is_done(run, study_file, tmp_path):
     assert again == (DONE, printed, [])
 
 
-@pytest.mark.parametrize("command", cli.COMMANDS)
-def test_every_command_has_a_summary_and_json(run, command):
-    status, printed, complaints = run(command, "--help")
+def test_help_lists_every_command(run):
+    status, listed, complaints = run("--help")
     assert (status, complaints) == (DONE, [])
-    assert any("--json" in line for line in printed)
-    _, listed, _ = run("--help")
-    assert any(re.match(rf" +{command} +[a-z]", line) for line in listed)
+    for command in cli.COMMANDS:
+        assert any(re.match(rf" +{command} +[a-z]", line) for line in listed)
+        status, printed, complaints = run(command, "--help")
+        assert (status, complaints) == (DONE, [])
+        assert any("--json" in line for line in printed)
 
 
 @pytest.mark.parametrize(

@@ -189,7 +189,6 @@ def test_known_elements_on_the_command_line(skin, tmp_path, capsys):
     etid.write_report(tmp_path / "fits.h5", tmp_path / "page.html")
     assert "r_s = 33000 (fixed)" in (tmp_path / "page.html").read_text("utf-8")
     for options, words in (
-        (["--fix", "r_s=1,2"], "--fix r_s has 2 numbers; write --fix r_s=500"),
         (["--fix", "r_s=1", "--fix", "r_s=2"], "names an element twice: r_s, r_s"),
         (["--fix", "r_x=1"], "'r_x' is no element of SkinRC"),
         (["--joint", "--fix", "r_x=1"], "'r_x' is no element of SkinRC"),
@@ -197,9 +196,10 @@ def test_known_elements_on_the_command_line(skin, tmp_path, capsys):
         capsys.readouterr()
         assert cli.main([*command, *options]) == 1
         assert words in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        cli.main([*command, "--prior", "r_s=much"])
-    assert "write --fix r_s=500 or --prior r_s=500,50" in capsys.readouterr().err
+    for option, told, right in (("--prior", "r_s=much", "500,50"), ("--fix", "r_s=1,2", "500")):
+        with pytest.raises(SystemExit):
+            cli.main([*command, option, told])
+        assert f"write {option} r_s={right}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import etid
 from etid.cli import main
 from etid.files.folder import import_folder, labelled, resistance
 from etid.files.importing import import_file
-from etid.files.pattern import Pattern
+from etid.files.pattern import pattern
 from etid.recordings.recording import RecordingError
 
 OPTIONS = {"v_th": "open", "v_out": "skin", "time": "t", "scale": 0.5, "pulse_rate": 60.0}
@@ -31,9 +31,11 @@ def folder(tmp_path):
     return root
 
 
-def test_names_become_labels_and_each_day_has_its_own_calibration(folder, tmp_path):
+def test_names_become_labels_and_the_mapping_beside_the_file_imports_the_same(folder, tmp_path):
     target = tmp_path / "study.h5"
     found = import_folder(folder, target, PATTERNS, **OPTIONS)
+    import_file(folder, tmp_path / "again.h5", found.mapping)
+    assert target.read_bytes() == (tmp_path / "again.h5").read_bytes()
     assert found.unmatched == ["notes.txt"]
     assert "4 files, 2 of them with a known resistor" in str(found)
     assert "s01_d2_07.csv → s01/d2/07: subject s01, session d2, trial 07" in str(found)
@@ -43,13 +45,6 @@ def test_names_become_labels_and_each_day_has_its_own_calibration(folder, tmp_pa
         assert (second.subject, second.session, second.trial) == ("s01", "d2", "07")
         assert second.calibration == ("calibration/d2/98800",)
         np.testing.assert_allclose(second.v_out, 2 * pulses(0.4))
-
-
-def test_the_mapping_beside_the_file_imports_the_same_again(folder, tmp_path):
-    first, again = tmp_path / "first.h5", tmp_path / "again.h5"
-    mapping = import_folder(folder, first, PATTERNS, **OPTIONS).mapping
-    import_file(folder, again, mapping)
-    assert first.read_bytes() == again.read_bytes()
 
 
 def test_the_command_replaces_no_mapping_unasked(folder, tmp_path, capsys):
@@ -69,27 +64,24 @@ def test_a_table_names_resistors_of_files_whose_names_do_not(folder):
     assert unmatched == ["notes.txt"]
 
 
-@pytest.mark.parametrize(
-    ("name", "labels"),
-    [
-        ("s01_dry_3.csv", {"subject": "s01", "condition": "dry", "trial": "3"}),
-        ("s01_dry_wet_3.csv", None),  # which of them is the condition?
-        ("s01_dry_3.1.csv", None),
-        ("x/s01_dry_3.csv", None),
-        ("s01_dry_3.csv.bak", None),
-        ("s01__3.csv", None),
-    ],
-)
-def test_a_name_that_could_be_read_in_two_ways_does_not_match(name, labels):
-    assert Pattern("{subject}_{condition}_{trial}.csv").labels(name) == labels
+def test_a_name_that_could_be_read_in_two_ways_does_not_match():
+    expression = pattern("{subject}_{condition}_{trial}.csv")
+    match = expression.fullmatch("s01_dry_3.csv")
+    assert match is not None
+    assert match.groupdict() == {"subject": "s01", "condition": "dry", "trial": "3"}
+    for name in (
+        "s01_dry_wet_3.csv",  # which of them is the condition?
+        "s01_dry_3.1.csv",
+        "x/s01_dry_3.csv",
+        "s01_dry_3.csv.bak",
+        "s01__3.csv",
+    ):
+        assert expression.fullmatch(name) is None, name
 
 
-@pytest.mark.parametrize(
-    ("text", "ohm"),
-    [("98800", 98.8e3), ("98k8", 98.8e3), ("98.8k", 98.8e3), ("4R7", 4.7), ("1M", 1e6)],
-)
-def test_resistances_are_written_as_in_electronics(text, ohm):
-    assert resistance(text, "file") == pytest.approx(ohm)
+def test_resistances_are_written_as_in_electronics():
+    texts = {"98800": 98.8e3, "98k8": 98.8e3, "98.8k": 98.8e3, "4R7": 4.7, "1M": 1e6}
+    assert {text: resistance(text, "file") for text in texts} == pytest.approx(texts)
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ import pytest
 
 import etid
 from etid.files import channel as channels
-from etid.files.channel import UNITS, parse_unit
+from etid.files.channel import parse_unit
 from etid.files.readers import delimited as text_rows
 from etid.recordings.recording import RecordingError
-from tests.lab_files import LINE, abf, imported, matlab, refused, rig, table, tdms
+from tests.lab_files import LINE, abf, imported, matlab, refused, rig, table, tdms, wav
 
 README = pathlib.Path(__file__).parents[1] / "data_schema" / "README.md"
 RNG = np.random.default_rng(6)
@@ -38,6 +38,14 @@ def sweep(number):
 
 
 SWEEPS = {**GIVEN, "v_th": sweep(0), "v_out": sweep(1)}  # both records in one channel
+
+
+@pytest.fixture(params=["at once", "in parts"])
+def parts(request, monkeypatch):
+    """Records of a thousand samples are read at once, and in 143 parts."""
+    if request.param == "in parts":
+        monkeypatch.setattr(channels, "BLOCK", 7)
+        monkeypatch.setattr(text_rows, "ROWS", 13)
 
 
 # What the README of the schema shows
@@ -66,7 +74,7 @@ def test_the_csv_of_the_readme_is_imported_by_its_mapping(tmp_path):
 
 
 @pytest.mark.parametrize("version", [5, 7.3])
-def test_the_matlab_file_of_the_readme_is_imported_by_its_mapping(version, tmp_path):
+def test_the_matlab_file_of_the_readme_is_imported_by_its_mapping(version, parts, tmp_path):
     trials = np.stack([V_OUT, V_OUT / 2, V_OUT / 3])
     known, dry = {"open": V_TH, "loaded": V_OUT}, {"open": V_TH, "skin": trials}
     path = matlab(tmp_path / "session.mat", version, known=known, dry=dry)
@@ -80,7 +88,7 @@ def test_the_matlab_file_of_the_readme_is_imported_by_its_mapping(version, tmp_p
         np.testing.assert_allclose(one.v_th, V_TH / 0.0535, rtol=1e-15)
 
 
-def test_the_tdms_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
+def test_the_tdms_file_of_the_readme_is_imported_by_its_mapping(parts, tmp_path):
     names = ("known/open", "known/loaded", "s01 dry/open", "s01 dry/skin", "s01 dry/shunt")
     signals = {name: (V_TH * number, {}) for number, name in enumerate(names, 1)}
     path = tdms(tmp_path / "s.tdms", signals, unit_string="Volts", wf_increment=5e-6)
@@ -93,7 +101,7 @@ def test_the_tdms_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
     assert str(used[1].signals["current"]) == "'s01 dry/shunt' in Volts (file), divided by 100"
 
 
-def test_the_abf_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
+def test_the_abf_file_of_the_readme_is_imported_by_its_mapping(parts, tmp_path):
     sweeps = np.stack([V_TH, V_OUT, V_OUT / 2])
     recordings, _ = imported(abf(tmp_path / "cell.abf", sweeps, unit="mV"), example("ABF"))
     assert list(recordings) == ["s01/dry/0", "s01/dry/1"]
@@ -108,49 +116,58 @@ def test_the_abf_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
 # TDMS
 
 
-def test_codes_with_a_linear_scaling_stay_codes(tmp_path):
-    recordings, _ = imported(rig(tmp_path, V_TH, CODES, **LINE), pair())
+@pytest.mark.parametrize("kind", ["i2", "f4", "f8"])
+def test_a_linear_scaling_is_applied_once_and_leaves_samples(kind, tmp_path):
+    codes = CODES.astype(kind)
+    recordings, _ = imported(rig(tmp_path, V_TH, codes, **LINE), pair())
     record = recordings["loaded/0"].samples["v_out"]
-    np.testing.assert_array_equal(record.stored, CODES)
-    assert record.stored.dtype == np.int16
     volts = (2e-3 * CODES + 0.5) / 0.0535
     np.testing.assert_allclose(record.values, volts, rtol=0, atol=1e-13)  # of terms of up to 112
+    np.testing.assert_array_equal(record.stored, codes)
+    assert record.stored.dtype == codes.dtype
+    scaled = rig(tmp_path, V_TH, codes, **LINE, NI_Scaling_Status="scaled")  # before it was written
+    np.testing.assert_allclose(imported(scaled, pair())[0]["loaded/0"].v_out, CODES / 0.0535)
+    for name, value in (("Slope", 0.0), ("Slope", np.nan), ("Y_Intercept", np.inf)):
+        path = rig(tmp_path, V_TH, codes, **LINE | {f"NI_Scale[0]_Linear_{name}": value})
+        refused(path, pair(), "v_out: channel 'rig/skin' is scaled with slope")
 
 
-def test_data_that_were_scaled_before_they_were_written_are_not_scaled_again(tmp_path):
-    path = rig(tmp_path, V_TH, V_OUT, **LINE, NI_Scaling_Status="scaled")
-    np.testing.assert_allclose(imported(path, pair())[0]["loaded/0"].v_out, V_OUT / 0.0535)
-
-
-@pytest.mark.parametrize("cut", [1, 500, 15_900, 16_200])
-def test_a_tdms_file_that_was_cut_off_is_refused_wherever_it_was(cut, tmp_path):
-    path = rig(tmp_path, V_TH, V_OUT)
-    path.write_bytes(path.read_bytes()[:-cut])
-    refused(path, pair(), "is truncated: the last segment ends at byte")
+@pytest.mark.parametrize(
+    ("make", "said", "cuts"),
+    [
+        (lambda path: rig(path, V_TH, V_OUT), pair(), (1, 500, 15_900, 16_200)),
+        (lambda path: abf(path / "a.abf", [V_TH, V_OUT]), SWEEPS, (100, 600, 4044, 6044)),
+        *(
+            (lambda path, kind=kind: wav(path / "a.wav", kind), columns("1", "2"), (1, 2, 3, 4, 40))
+            for kind in ("int16", "float32", "24 bits")
+        ),
+    ],
+)
+def test_a_file_that_was_cut_off_is_refused_wherever_it_was(make, said, cuts, tmp_path):
+    path = make(tmp_path)
+    whole = path.read_bytes()
+    for cut in cuts:
+        path.write_bytes(whole[:-cut])
+        refused(path, said, "is truncated: .* ends? at byte|cannot be read")
+    path.write_bytes(whole)
+    assert len(imported(path, said)[0]) == 1
 
 
 # MATLAB
 
 
-def test_matlab_variables_that_are_no_real_arrays_are_refused_in_both_versions(tmp_path):
-    for version in (5, 7.3):
-        path = matlab(tmp_path / "m.mat", version, open=V_TH, skin=V_OUT * 1j, name="finger")
-        units = {"v_th": {"channel": "open", "unit": "V"}, "sample_rate": 2e5}
-        for name in ("skin", "name"):
-            said = {**GIVEN, **units, "v_out": {"channel": name, "unit": "V"}}
-            refused(path, said, rf"v_out: '{name}' is .*must be an array of real numbers")
-
-
-def test_matlab_7_3_needs_no_package_and_cells_and_references_are_no_channels(
-    tmp_path, monkeypatch
-):
-    monkeypatch.setitem(sys.modules, "pymatreader", None)
-    path = matlab(tmp_path / "m.mat", 7.3, **{"#refs#": {"a": V_TH}}, open=V_TH, skin=V_OUT)
-    target = tmp_path / "m.h5"
-    etid.import_file(path, target, v_th="open", v_out="skin", sample_rate=2e5, **GIVEN)
-    refs: dict[str, Any] = {"v_th": "#refs#.a", "v_out": "skin", "sample_rate": 2e5}
-    with pytest.raises(RecordingError, match=r"the names are 'open', 'skin'\."):
-        etid.import_file(path, target, **refs, **GIVEN)
+@pytest.mark.parametrize("version", [5, 7.3])
+def test_matlab_variables_that_are_no_real_arrays_are_refused(version, tmp_path):
+    variables: dict = {"open": V_TH, "skin": V_OUT * 1j, "name": "finger"}
+    if version == 7.3:
+        variables["#refs#"] = {"a": V_TH}  # the cells of other variables
+    path = matlab(tmp_path / "m.mat", version, **variables)
+    for name, message in (
+        ("skin", "v_out: 'skin' is .*must be an array of real numbers"),
+        ("name", "v_out: 'name' is .*must be an array of real numbers"),
+        ("#refs#.a", r"the names are ['a-z, ]+\. Use"),
+    ):
+        refused(path, columns("open", name, sample_rate=2e5), message)
 
 
 # ABF
@@ -160,14 +177,6 @@ def test_the_rate_of_an_abf_file_is_not_cut_to_whole_hertz(tmp_path):
     for rate in (150e3, 200e3, 33_333.0, 1e6 / 7):
         recordings, _ = imported(abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]), rate), SWEEPS)
         assert recordings["loaded/0"].sample_rate == pytest.approx(rate, rel=1e-7)  # a float32
-
-
-def test_an_abf_file_that_was_cut_off_is_refused(tmp_path):
-    path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]))
-    whole = path.read_bytes()
-    for cut in (600, len(whole) - 2100, len(whole) - 100):
-        path.write_bytes(whole[:-cut])
-        refused(path, SWEEPS, "cut off|cannot be read")
 
 
 # CSV
@@ -192,10 +201,9 @@ def test_a_table_without_names_has_numbered_columns(tmp_path):
 
 
 def test_a_preamble_may_stand_beside_the_numbers(tmp_path):
-    path = tmp_path / "tds.csv"  # as of Tektronix TDS
     beside = ["Record Length,3,s", "Sample Interval,5e-6,s", "Source,CH1,", ",,", ",,"]
     rows = [f"{text},{i / 2e5:.6e},{i},{2 * i},\n" for i, text in enumerate(beside)]
-    path.write_text("".join(rows), encoding="utf-8")
+    path = table(tmp_path, "".join(rows))  # as of Tektronix TDS
     refused(path, pair("CH1", "CH2", sample_rate=2e5), "columns 1, 2, 3, 4, 5, 6, 7.*header-line 0")
     told = columns("5", "6", time={"channel": "4", "unit": "s"}, header_line=0)
     recordings, _ = imported(path, told)
@@ -203,27 +211,18 @@ def test_a_preamble_may_stand_beside_the_numbers(tmp_path):
 
 
 def test_the_clock_may_start_beside_the_units(tmp_path):
-    path = tmp_path / "rigol.csv"
-    path.write_text(
-        "X,CH1,CH2,Start,Increment,\nSequence,VOLT,VOLT,-6e-3,5e-6\n0,1,2,\n1,3,4,\n2,5,6,\n",
-        encoding="utf-8",
-    )
-    told = {**GIVEN, "sample_rate": 2e5, "v_th": {"channel": "CH1"}, "v_out": {"channel": "CH2"}}
-    recordings, [used] = imported(path, told)
+    beside_units = "X,CH1,CH2,Start,Increment,\nSequence,VOLT,VOLT,-6e-3,5e-6\n"
+    rigol = beside_units + "0,1,2,\n1,3,4,\n2,5,6,\n"
+    path, told = table(tmp_path, rigol), pair("CH1", "CH2")
+    recordings, [used] = imported(path, {**told, "sample_rate": 2e5})
     np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 0.0535)
     assert str(used.signals["v_out"]).startswith("'CH2' in VOLT (file)")
     assert used.rate_by == "mapping; file 200000 Hz"
-    path.with_suffix(".h5").unlink()
     refused(path, {**told, "sample_rate": 1e5}, "200000 Hz from the file")
-    del told["sample_rate"]
-    _, [used] = imported(path, told)
-    assert (used.sample_rate, used.rate_by) == (2e5, "file")
-    path.with_suffix(".h5").unlink()
-    path.write_text("CH1(V),CH2(V),t0 =-6e-3, tInc = 5e-6,\n1,2\n3,4\n5,6\n", encoding="utf-8")
-    _, [used] = imported(path, told)
-    assert (used.sample_rate, used.rate_by) == (2e5, "file")
-    path.with_suffix(".h5").unlink()
-    path.write_text("X,CH1,CH2\nSequence,VOLT,VOLT\n0,1,2\n1,3,4\n", encoding="utf-8")
+    for text in (rigol, "CH1(V),CH2(V),t0 =-6e-3, tInc = 5e-6,\n1,2\n3,4\n5,6\n"):
+        _, [used] = imported(table(tmp_path, text), told)
+        assert (used.sample_rate, used.rate_by) == (2e5, "file")
+    path = table(tmp_path, "X,CH1,CH2\nSequence,VOLT,VOLT\n0,1,2\n1,3,4\n")
     refused(path, {**told, "time": {"channel": "X"}}, "the file says 'Sequence' of channel 'X'")
 
 
@@ -237,7 +236,6 @@ def test_v_th_may_be_a_channel_of_another_file(tmp_path, monkeypatch):
     np.testing.assert_allclose(recordings["loaded/0"].v_th, np.array([1, 2, 3]) / 0.0535)
     np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([4, 5, 6]) / 0.0535)
     assert str(used.signals["v_th"]).startswith("'open.csv:a' in V")
-    finger.with_suffix(".h5").unlink()
     wrong = columns("open.csv:b", "skin", sample_rate=2e5)
     refused(finger, wrong, "the names are 'skin', 'open.csv:a'")
     pathlib.Path("open.csv").write_text("a\n1\n2\nx\n", encoding="utf-8")
@@ -245,66 +243,34 @@ def test_v_th_may_be_a_channel_of_another_file(tmp_path, monkeypatch):
         etid.import_file(finger, "t.h5", told)
 
 
-# Parts
-
-
-@pytest.fixture
-def small_parts(monkeypatch):
-    """Records of a thousand samples are read in 143 parts."""
-    monkeypatch.setattr(channels, "BLOCK", 7)
-    monkeypatch.setattr(text_rows, "ROWS", 13)
-
-
-@pytest.mark.parametrize("format", ["csv", "mat", "tdms", "abf"])
-def test_what_is_read_in_parts_is_what_is_read_at_once(format, small_parts, tmp_path):
-    volts = {"v_th": {"channel": "open", "unit": "V"}, "v_out": {"channel": "skin", "unit": "V"}}
-    said = {**GIVEN, **volts, "sample_rate": 2e5}
-    if format == "csv":
-        path = tmp_path / "a.csv"
-        rows = np.column_stack([np.arange(1000) / 2e5, V_TH, V_OUT])
-        np.savetxt(path, rows, "%.17g", ",", header="t [s],open,skin", comments="")
-        del said["sample_rate"]
-        said["time"] = {"channel": "t"}
-    elif format == "mat":
-        path = matlab(tmp_path / "a.mat", 7.3, open=V_TH, skin=np.stack([V_TH, V_OUT]))
-        said["v_out"]["rows"] = 1
-    elif format == "tdms":
-        path, said = rig(tmp_path, V_TH, V_OUT), pair()
-    else:
-        path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]))
-        said = pair()
-        said["v_th"] = {"channel": "channel 0", "rows": 0}
-        said["v_out"] = {"channel": "channel 0", "rows": 1}
-    recordings, _ = imported(path, said)
-    one = next(iter(recordings.values()))
-    step = one.samples["v_out"].resolution or 0.0
-    np.testing.assert_allclose(one.v_out, V_OUT / 0.0535, rtol=1e-14, atol=1.001 * step)
-    np.testing.assert_allclose(one.v_th, V_TH / 0.0535, rtol=1e-14, atol=1.001 * step)
-    assert one.sample_rate == pytest.approx(200e3, rel=1e-12)
-    assert [path for path in tmp_path.iterdir() if path.suffix not in (f".{format}", ".h5")] == []
-
-
-def test_time_stamps_are_checked_in_every_part(small_parts, tmp_path):
-    path = tmp_path / "t.csv"
-    times = np.arange(1000) / 2e5
-    for wrong in (300, 999):
+def test_numbers_and_time_stamps_of_a_table_are_checked_in_every_part(parts, tmp_path):
+    times, path = np.arange(1000) / 2e5, tmp_path / "t.csv"
+    said = pair("open", "skin", time={"channel": "t"})
+    for wrong in (300, 999, 1000):
         stamps = np.where(np.arange(1000) >= wrong, times + 3e-6, times)
         rows = np.column_stack([stamps, V_TH, V_OUT])
         np.savetxt(path, rows, "%.17g", ",", header="t [s],open [V],skin [V]", comments="")
-        said = pair("open", "skin", time={"channel": "t"})
-        refused(path, said, r"time: is not uniform: sample \d+")
+        if wrong < 1000:
+            refused(path, said, r"time: is not uniform: sample \d+")
+    one = imported(path, said)[0]["loaded/0"]
+    np.testing.assert_allclose(one.v_out, V_OUT / 0.0535, rtol=1e-14)
+    np.testing.assert_allclose(one.v_th, V_TH / 0.0535, rtol=1e-14)
+    assert one.sample_rate == pytest.approx(200e3, rel=1e-12)
+    assert [*tmp_path.iterdir()] == [path]
 
 
 # For all
 
 
 @pytest.mark.parametrize(
-    ("name", "package"), [("a.tdms", "npTDMS"), ("a.abf", "pyabf"), ("a.mat", "pymatreader")]
+    ("name", "package", "extra"),
+    [("a.tdms", "npTDMS", "tdms"), ("a.abf", "pyabf", "abf"), ("a.xlsx", "openpyxl", "excel")],
 )
-def test_without_its_reader_a_file_names_what_to_install(name, package, tmp_path, monkeypatch):
+def test_without_its_reader_a_file_names_what_to_install(
+    name, package, extra, tmp_path, monkeypatch
+):
     monkeypatch.setitem(sys.modules, package.lower(), None)
     (tmp_path / name).write_bytes(b"anything")
-    extra = {"npTDMS": "tdms", "pyabf": "abf", "pymatreader": "matlab"}[package]
     refused(tmp_path / name, pair(), rf"needs the package {package}.*'etid\[{extra}\]'")
 
 
@@ -328,4 +294,3 @@ def test_units_are_those_of_the_si_and_their_names():
         assert parse_unit(text) == (factor, unit), text
     for text in ("", "MV", "mv", "v", "a", "S", "Ohm", "degC", "V/A", "1"):
         assert parse_unit(text) is None, text
-    assert len(UNITS) == 3 * 8 + 9 * 6

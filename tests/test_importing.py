@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import pytest
@@ -131,6 +132,8 @@ def times(*stamps):
 
 BY_TIME = {"sample_rate": None, "time": "t"}
 ROWS = "t,th,out,i\n0,1,2,3\n1,4,5,6\n"
+COMMAS, SAID = "t;th;out\n0;1,5;2,5\n1;{};1,5\n", {"delimiter": ";", "decimal": ","}
+SHIFTED = "t,th,out{0}\n0,1.5,2.5{0}\n{1}\n0,1.5,2.5{0}\n"
 
 
 @pytest.mark.parametrize(
@@ -149,10 +152,15 @@ ROWS = "t,th,out,i\n0,1,2,3\n1,4,5,6\n"
         (times(0, -1, -2, -3, -4), BY_TIME, "time: does not increase"),
         (times(0, 1, np.nan, 3, 4), BY_TIME, "time: is not uniform"),
         (times(*[np.nan] * 5), BY_TIME, "time: does not increase"),
-        (ROWS, {"v_th": "Vth"}, r"v_th: there is no 'Vth'; the names are 't', 'th', 'out', 'i'"),
-        (ROWS, {"v_out": None}, "v_out: is not given, and is not guessed"),
-        (ROWS, {"pulse_rate": None}, "pulse_rate: is not given"),
-        (ROWS, {"scale": None}, "scale: is not given.*1 if the values are those at the terminal"),
+        (COMMAS.format("1.234"), SAID, "line 3 has the cell '1.234', but the decimal sign is a"),
+        (COMMAS.format("-12.345.678"), SAID, "line 3 has the cell '-12.345.678', but"),
+        (COMMAS.format("0.5"), SAID, "line 3 has the cell '0.5', but the decimal sign is a comma"),
+        (SHIFTED.format(",", "0.0,-1,23,4,56"), {}, "line 3 has 5 cells; the table has"),
+        (SHIFTED.format("", "0.0,-1,23,4,56"), {}, "line 3 has 5 cells; the table has"),
+        (SHIFTED.format(",", "0.0,1,5,2.5"), {}, "line 3 has 4 cells; the table has"),
+        (SHIFTED.format("", "0.0,1,5,2.5"), {}, "line 3 has 4 cells; the table has"),
+        (SHIFTED.format(",", "-1.23,4.56"), {}, "line 3 has 2 cells; the table has"),
+        (SHIFTED.format("", "-1.23,4.56"), {}, "line 3 has 2 cells; the table has"),
         (ROWS, {"sample_rate": None}, "one of time and sample_rate"),
         (ROWS, {"time": "t"}, "one of time and sample_rate"),
     ],
@@ -161,6 +169,76 @@ def test_a_wrong_table_is_explained(text, changes, message, tmp_path):
     path = tmp_path / "t.csv"
     path.write_bytes(text.encode("latin-1"))
     lab_files.refused(path, None, message, **{**TABLE, **changes})
+
+
+BARE = {**TABLE, "scale": 1.0}
+COUNT = 30
+V_TH = np.round(np.random.default_rng(8).normal(size=COUNT), 3)
+V_OUT = V_TH / 2
+
+
+def rows(sign=".", between=",", end=""):
+    """Times, V_th and V_out in text."""
+    lines = [
+        between.join(f"{x:.6f}".replace(".", sign) for x in (i * 5e-6, a, b)) + end
+        for i, (a, b) in enumerate(zip(V_TH, V_OUT, strict=True))
+    ]
+    return [f"{line}\n" for line in lines]
+
+
+def noticed(path, **given):
+    """The recording of a file, and the notices."""
+    recordings, [used] = lab_files.imported(path, **{**BARE, **given})
+    return recordings["loaded/0"], used.notices
+
+
+def refused(path, message, **given):
+    assert lab_files.refused(path, None, message, **{**BARE, **given}).remedy
+
+
+def test_notes_quotes_and_delimiters_at_the_end_are_no_fault(tmp_path):
+    ends = ["\n", ",\n", ",fine\n", ',"fine, though"\n', ",,\n"]
+    lines = [line[:-1] + ends[i % len(ends)] for i, line in enumerate(rows())]
+    lines = [re.sub(r"^([^,]*)", r'"\1"', line) if i % 3 else line for i, line in enumerate(lines)]
+    one, notices = noticed(
+        lab_files.table(tmp_path, "t,th,out,note\n" + "".join(lines)), time="t", sample_rate=None
+    )
+    np.testing.assert_array_equal(one.v_th, V_TH)
+    np.testing.assert_allclose(one.v_out, V_OUT, rtol=0, atol=1e-12)
+    assert notices == ()
+
+
+@pytest.mark.parametrize(("sign", "between", "end"), [(".", ",", ""), (",", ";", ";")])
+def test_a_table_that_ends_inside_a_number_is_taken_with_a_notice(sign, between, end, tmp_path):
+    told = {} if sign == "." else {"delimiter": between, "decimal": sign}
+    text = between.join(["t", "th", "out"]) + end + "\n" + "".join(rows(sign, between, end))
+    whole = text.rstrip(end + "\n")
+    for shown in (text, whole):  # a line break is often missing
+        assert noticed(lab_files.table(tmp_path, shown), **told)[1] == ()
+    one, [notice] = noticed(lab_files.table(tmp_path, whole[:-4]), **told)
+    last = whole[:-4].rpartition(between)[2]
+    assert notice.startswith(f"the last number, '{last}', is shorter than those above")
+    assert one.v_out[-1] == float(last.replace(",", "."))
+    refused_end = whole.rpartition(between)[0]
+    refused(lab_files.table(tmp_path, refused_end), "has 2 cells; the table has", **told)
+
+
+def test_the_preamble_of_an_oscilloscope_is_compared_with_its_table(tmp_path):
+    body = "t [s],th [V],out [V]\n" + "".join(rows())
+
+    def scope(length, interval):
+        said = f"Model,DPO\nRecord Length,{length}\nSample Interval,{interval}\n"
+        return lab_files.table(tmp_path, said + body)
+
+    told: dict = {"time": "t", "header_line": 4, "sample_rate": None}
+    assert noticed(scope(30, "5e-06,s"), **told)[1] == ()
+    assert noticed(scope("3.0e+01", "5,us"), **told)[1] == ()
+    without, _ = noticed(scope(30, "5e-06"), header_line=4, sample_rate=None)
+    assert without.sample_rate == 200e3
+    _, [used] = lab_files.imported(scope(40, "5e-06"), **{**BARE, **told})
+    notice = "the table has 30 rows, its preamble declares 40 samples"
+    assert str(used).endswith(f"\n  note: {notice}")
+    refused(scope(30, "1e-05"), "is 200000 Hz from the time 't', but 100000 Hz from the f", **told)
 
 
 @pytest.mark.parametrize("version", [5, 7.3])
@@ -178,9 +256,3 @@ def test_matlab_trials_are_rows_and_codes_stay_integers(version, tmp_path):
     np.testing.assert_array_equal(
         imported(column, **TABLE | {"scale": 1})["loaded/0"].v_out, TH / 2
     )
-
-
-def test_a_field_of_a_matlab_structure_has_a_dotted_name(tmp_path):
-    path = matlab(tmp_path / "m.mat", 5, scope={"th": TH, "out": TH / 2, "who": "me"})
-    arguments = {**TABLE, "v_th": "scope.th", "v_out": "scope.out"}
-    assert imported(path, **arguments)["loaded/0"].v_th.size == 5

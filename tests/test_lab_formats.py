@@ -7,11 +7,12 @@ import scipy.io.wavfile
 import etid
 from etid import RecordingError
 from tests import lab_files
-from tests.lab_files import labview
+from tests.lab_files import labview, refused
 
 RATE, PULSES = 20e3, 60.0
 PERIOD = RATE / PULSES
 FIELDS = {"pulse_rate": PULSES, "scale": 1.0}
+NAMES = {"v_th": "open", "v_out": "skin"}
 
 
 def pulses(periods=6, before=0):
@@ -34,6 +35,13 @@ def imported(path, **given):
     return list(recordings.values()), used
 
 
+def of_arrays(folder, arrays, **given):
+    """The recordings of an npz file of the channels `th`, `out` and others."""
+    np.savez(folder / "a.npz", **arrays)
+    told = {"v_th": "th", "v_out": "out", "sample_rate": RATE, **given}
+    return imported(folder / "a.npz", **told)
+
+
 @pytest.mark.parametrize("kind", [np.int16, np.int32, np.uint8, np.float32])
 def test_a_wav_file_holds_fractions_of_full_scale(kind, tmp_path):
     th, out = pulses()
@@ -42,10 +50,18 @@ def test_a_wav_file_holds_fractions_of_full_scale(kind, tmp_path):
     middle = 128 if kind is np.uint8 else 0
     codes = (both * full + middle).round(0 if full > 1 else 9).astype(kind)
     scipy.io.wavfile.write(tmp_path / "a.wav", int(RATE), codes)
+    with (tmp_path / "a.wav").open("ab") as file:
+        file.write(b"LIST" + (4).to_bytes(4, "little") + b"INFO")  # as sound editors append it
     [recording], [used] = imported(tmp_path / "a.wav", v_th="1", v_out="2", scale=0.01)
     assert (recording.sample_rate, used.rate_by) == (RATE, "file")
     np.testing.assert_allclose(recording.v_th, th, atol=100 / full if full > 1 else 1e-5)
     np.testing.assert_allclose(recording.v_out, out, atol=100 / full if full > 1 else 1e-5)
+
+
+def virtual(path, times=None, step=1 / RATE, **said):
+    """A LabVIEW file of pulses."""
+    times = [f"{i / RATE:.6f}" for i in range(2000)] if times is None else times
+    return labview(path / "a.lvm", times, *pulses(), step=f"{step:.6E}", **said)
 
 
 @pytest.mark.parametrize(
@@ -54,16 +70,42 @@ def test_a_wav_file_holds_fractions_of_full_scale(kind, tmp_path):
 )
 def test_a_labview_file_says_how_it_is_written(separator, decimal, columns, tmp_path):
     th, out = pulses()
-    times = ["" if columns == "No" else f"{i / RATE:.6f}" for i in range(th.size)]
-    path = labview(
-        tmp_path / "a.lvm", times, th, 1e3 * out, step=f"{1 / RATE:.6E}", separator=separator,
+    path = virtual(
+        tmp_path, [""] * 2000 if columns == "No" else None, separator=separator,
         decimal=decimal, columns=columns, unit="mV",
     )  # fmt: skip
-    [recording], [used] = imported(path, v_th="open", v_out="skin")
-    np.testing.assert_allclose(recording.v_out, out, atol=1e-6)
+    [recording], [used] = imported(path, **NAMES)
+    np.testing.assert_allclose(recording.v_out, out / 1e3, atol=1e-9)
     np.testing.assert_allclose(recording.v_th, th, atol=1e-6)
     assert recording.sample_rate == RATE
     assert str(used.signals["v_out"]) == "'skin' in mV (file)"
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"count": 2001}, "'open' has 2000 samples, the file declares 2001"),
+        ({"step": 2 / RATE}, "Delta_X: is 0.0001 s, but the column of times has steps of 5e-05 s"),
+        ({"step": 0.5 / RATE}, "Delta_X: is 2.5e-05 s, but the column of times has steps"),
+        ({"name": "open [mV]"}, r"v_th: the file says 'Volts' and 'mV' of channel 'open \[mV\]'"),
+    ],
+)
+def test_a_labview_file_that_contradicts_itself_is_refused(said, message, tmp_path):
+    names = {**NAMES, "v_th": said.get("name", "open")}
+    assert refused(virtual(tmp_path, **said), None, message, **names, **FIELDS).remedy
+
+
+def test_a_labview_file_may_have_coarse_times_more_samples_and_a_cut_end(tmp_path):
+    coarse = [f"{i / RATE:.4f}" for i in range(2000)]
+    again = [f"{i % 500 / RATE:.6f}" for i in range(2000)]  # appended three times
+    for times in ([""] * 2000, coarse, again):
+        assert imported(virtual(tmp_path, times), **NAMES)[0][0].sample_rate == RATE
+    # LabVIEW appends to a file without changing its header.
+    [one], _ = imported(virtual(tmp_path, count=10), **NAMES)
+    np.testing.assert_array_equal(one.v_th, pulses()[0])
+    path = virtual(tmp_path)
+    path.write_text(path.read_text()[:-5])
+    assert "the last number" in imported(path, **NAMES)[1][0].notices[0]
 
 
 def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
@@ -87,23 +129,23 @@ def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
 
 def test_arrays_of_an_npz_file_are_channels(tmp_path):
     th, out = pulses()
-    np.savez(tmp_path / "a.npz", open=th, finger=np.stack([out, out / 2]), note=np.array("text"))
-    recordings, _ = imported(tmp_path / "a.npz", v_th="open", v_out="finger", sample_rate=RATE)
+    arrays = {"open": th, "finger": np.stack([out, out / 2]), "note": np.array("text")}
+    arrays["mV [mV]"] = 1e3 * th
+    recordings, _ = of_arrays(tmp_path, arrays, v_th="mV [mV]", v_out="finger")
     assert [one.path for one in recordings] == ["loaded/0", "loaded/1"]
     np.testing.assert_array_equal(recordings[1].v_out, out / 2)
-    np.testing.assert_array_equal(recordings[1].v_th, th)
-    with pytest.raises(RecordingError, match="the names are 'open', 'finger', 'note'"):
-        imported(tmp_path / "a.npz", v_th="opn", v_out="finger", sample_rate=RATE)
-    with pytest.raises(RecordingError, match="must be an array of real numbers"):
-        imported(tmp_path / "a.npz", v_th="note", v_out="finger", sample_rate=RATE)
+    np.testing.assert_allclose(recordings[1].v_th, th)
+    for name, message in (
+        ("opn", "the names are 'open', 'finger', 'note', "),
+        ("note", "must be an array of real numbers"),
+    ):
+        with pytest.raises(RecordingError, match=message):
+            of_arrays(tmp_path, arrays, v_th=name, v_out="finger")
 
 
 def test_a_long_record_is_split_at_its_pauses(tmp_path):
     th, out = long_record()
-    np.savez(tmp_path / "a.npz", th=th, out=out)
-    recordings, [used] = imported(
-        tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="pulses"
-    )
+    recordings, [used] = of_arrays(tmp_path, {"th": th, "out": out}, split="pulses")
     assert [one.trial for one in recordings] == ["0", "1", "2"]
     assert [round(one.periods, 2) for one in recordings] == [4, 6, 5]
     assert used.paths == ("loaded/0", "loaded/1", "loaded/2")
@@ -135,8 +177,7 @@ def in_turn(rests=(2000, 2000)):
     ],
 )
 def test_electrodes_that_fire_in_turn_become_recordings_of_each(tmp_path, given):
-    np.savez(tmp_path / "a.npz", **in_turn())
-    recordings, _ = imported(tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, **given)
+    recordings, _ = of_arrays(tmp_path, in_turn(), **given)
     found = {one.path: (one.electrode, one.trial) for one in recordings}
     assert found == {f"loaded/{e}/{n}": (e, n) for e in ("E7", "E12") for n in ("0", "1")}
     for one in recordings:
@@ -148,41 +189,33 @@ def test_electrodes_that_fire_in_turn_become_recordings_of_each(tmp_path, given)
 def test_electrodes_may_fire_without_a_pause(tmp_path):
     th = np.concatenate([pulses(6)[0], np.zeros(500)])
     which = np.where(np.arange(th.size) < 3 * PERIOD, 1.0, 2.0)
-    out = th / 2
-    np.savez(tmp_path / "a.npz", th=th, out=out, which=which)
-    recordings, _ = imported(
-        tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="which",
-        electrode="E{which}",
-    )  # fmt: skip
+    arrays = {"th": th, "out": th / 2, "which": which}
+    recordings, _ = of_arrays(tmp_path, arrays, split="which", electrode="E{which}")
     assert [one.electrode for one in recordings] == ["E1", "E2"]
     assert [round(one.periods, 1) for one in recordings] == [3, 3]
 
 
 @pytest.mark.parametrize(
-    ("rests", "given", "message"),
+    ("given", "message"),
     [
-        ((2000, 2000), {"electrode": ["E7", "E12"]}, "the list .*Give split too"),
-        ((2000, 2000), {"split": "pulses", "electrode": []}, "is the list"),
-        (
-            (2000, 2000),
-            {"split": "pulses", "electrode": ["E1", "E2", "E3"]},
-            "names 3 electrodes, but the record has 4 trains",
-        ),
-        ((0, 0), {"split": "pulses", "electrode": ["E7", "E12"]}, "cuts the first or the last"),
-        ((2000, 2000), {"split": "tilted", "electrode": "{tilted}"}, "is 3.75 at sample"),
-        ((2000, 2000), {"split": "what", "electrode": "E{what}"}, "there is no 'what'"),
-        (
-            (2000, 2000),
-            {"split": "which", "electrode": "E{which}", "trial": 3},
-            "1 labels for 4 trials",
-        ),
+        ({"electrode": ["E7", "E12"]}, "the list .*Give split too"),
+        ({"split": "pulses", "electrode": []}, "is the list"),
+        ({"split": "pulses", "electrode": ["E1", "E2", "E3"]},
+         "names 3 electrodes, but the record has 4 trains"),
+        ({"split": "pulses", "electrode": ["E7", "E12"], "rests": (0, 0)},
+         "cuts the first or the last"),
+        ({"split": "tilted", "electrode": "{tilted}"}, "is 3.75 at sample"),
+        ({"split": "what", "electrode": "E{what}"}, "there is no 'what'"),
+        ({"split": "which", "electrode": "E{which}", "trial": 3}, "1 labels for 4 trials"),
+        ({"split": "pulses", "v_out": "stack"}, "can be split"),
     ],
-)
-def test_refusals_of_electrodes_in_turn(tmp_path, rests, given, message):
-    held = in_turn(rests)
-    np.savez(tmp_path / "a.npz", **held, tilted=held["which"] / 2 + 0.25)
+)  # fmt: skip
+def test_refusals_of_a_record_that_is_split(tmp_path, given, message):
+    given = {"rests": (2000, 2000), **given}
+    held = in_turn(given.pop("rests"))
+    more = {"tilted": held["which"] / 2 + 0.25, "stack": np.stack([held["out"]] * 2)}
     with pytest.raises(RecordingError, match=message):
-        imported(tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, **given)
+        of_arrays(tmp_path, {**held, **more}, **given)
 
 
 def test_a_long_record_is_split_at_the_edges_of_a_trigger(tmp_path):
@@ -190,27 +223,22 @@ def test_a_long_record_is_split_at_the_edges_of_a_trigger(tmp_path):
     trigger = np.zeros(th.size)
     for start in (1900, 1900 + 3600, 1900 + 7300):  # before the trains, which begin with a rest
         trigger[start : start + 50] = 5.0
-    np.savez(tmp_path / "a.npz", th=th, out=out, trig=trigger)
-    recordings, _ = imported(
-        tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="trig"
-    )
+    recordings, _ = of_arrays(tmp_path, {"th": th, "out": out, "trig": trigger}, split="trig")
     whole = etid.Recording(th, out, sample_rate=RATE, pulse_rate=PULSES)
     # As by the pauses: a trial has whole periods, without the pause after them.
     for one, by_edge, by_pause in zip(recordings, whole.split(trigger), whole.split(), strict=True):
         np.testing.assert_array_equal(one.v_th, by_pause.v_th)
         np.testing.assert_array_equal(by_edge.v_th, by_pause.v_th)
         assert by_edge.path == by_pause.path
-    with pytest.raises(RecordingError, match="no rising edge"):
-        whole.split(np.zeros(th.size))
-    with pytest.raises(RecordingError, match=r"has shape \(5,\), must be"):
-        whole.split(np.zeros(5))
-    with pytest.raises(RecordingError, match="no pulse follows a rising edge"):
-        whole.split(np.arange(th.size) > th.size - 100)
+    for wrong, message in (
+        (np.zeros(th.size), "no rising edge"),
+        (np.zeros(5), r"has shape \(5,\), must be"),
+        (np.arange(th.size) > th.size - 100, "no pulse follows a rising edge"),
+    ):
+        with pytest.raises(RecordingError, match=message):
+            whole.split(wrong)
     with pytest.raises(RecordingError, match="without a pause"):
         etid.Recording(*pulses(), sample_rate=RATE, pulse_rate=PULSES).split()
-    np.savez(tmp_path / "b.npz", th=th, out=np.stack([out, out]))
-    with pytest.raises(RecordingError, match="can be split"):
-        imported(tmp_path / "b.npz", v_th="th", v_out="out", sample_rate=RATE, split="pulses")
 
 
 def test_arrays_become_a_study():

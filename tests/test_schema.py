@@ -1,7 +1,6 @@
 import pathlib
 import runpy
 
-import h5py
 import numpy as np
 import pytest
 
@@ -32,45 +31,7 @@ def test_the_example_of_the_readme_runs_and_is_read(tmp_path, monkeypatch):
         assert study["s01/dry/2"].v_th.max() == pytest.approx(expected, rel=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("sample_rate", "200 kHz", "is '200 kHz', must be a finite real number"),
-        ("sample_rate", True, "is True, must be a finite real"),
-        ("sample_rate", 1j, "must be a finite real number"),
-        ("sample_rate", [1.0, 2.0], "has shape"),
-        ("sample_rate", [], "is empty"),
-        ("sample_rate", h5py.Empty("f"), "is empty"),
-        ("kind", "skin", "is 'skin'"),
-        ("kind", 3, "is 3, must be text"),
-        ("subject", 1.5, "must be text or an integer"),
-        ("subject", b"\xff", "not UTF-8"),
-        ("trial", [[1, 2]], "has shape"),
-        ("adc_range", [1.0, 2.0, 3.0], "must be two increasing numbers"),
-        ("calibration", np.zeros(2, "i4,i4"), "compound"),
-    ],
-)
-def test_an_attribute_of_the_wrong_kind_is_refused(name, value, message):
-    with pytest.raises(ValueError, match=message):
-        schema.at("group attribute")[name].parse(value)
-
-
 def test_texts_of_every_hdf5_kind_are_read_alike():
     field = schema.at("group attribute")["calibration"]
     for value in ("a", b"a", np.bytes_(b"a"), np.array(["a"], object), np.array([b"a"])):
         assert field.parse(value) == ("a",)
-
-
-@pytest.mark.parametrize(
-    ("version", "problem"),
-    [
-        ("1.0", None),
-        ("1.17", None),
-        ("2.0", "is 2.0"),
-        ("1", "major.minor"),
-        ("new", "major.minor"),
-    ],
-)
-def test_minor_versions_are_read_and_major_ones_refused(version, problem):
-    found = schema.version_problem(version)
-    assert found is None if problem is None else problem in found

@@ -50,36 +50,41 @@ def test_columns_units_and_attributes_are_kept(path):
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "shape", "words"),
+    ("method", "arguments", "words"),
     [
-        ("other", "number", (), "the column is missing"),
-        ("name", "number", (), "is text, must be number"),
-        ("name", "integer", (), "is text, must be integer"),
-        ("size", "text", (), "is of type float64, must be text"),
-        ("size", "integer", (), "is of type float64, must be integer"),
-        ("half", "number", (), "is of type bool, must be number"),
-        ("matrix", "number", (), r"has shape \(3, 2, 2\), must be \(fit\)"),
-        ("matrix", "number", (2, 3), r"must be \(fit, 2, 3\)"),
-        ("matrix", "number", (4,), r"must be \(fit, 4\)"),
-        ("size", "number", (1,), r"has shape \(3,\), must be \(fit, 1\)"),
-        ("group", "number", (), "is not a column"),
-        ("empty", "number", (), r"has shape None, must be \(fit\)"),
-        ("scalar", "number", (), r"has shape \(\), must be \(fit\)"),
-        ("wide", "number", (), "is of type complex128, must be number"),
-        ("elsewhere", "number", (), "is a link to another file"),
+        ("column", ("other", "number"), "the column is missing"),
+        ("column", ("name", "number"), "is text, must be number"),
+        ("column", ("name", "integer"), "is text, must be integer"),
+        ("column", ("size", "text"), "is of type float64, must be text"),
+        ("column", ("size", "integer"), "is of type float64, must be integer"),
+        ("column", ("half", "number"), "is of type bool, must be number"),
+        ("column", ("matrix", "number"), r"has shape \(3, 2, 2\), must be \(fit\)"),
+        ("column", ("matrix", "number", (2, 3)), r"must be \(fit, 2, 3\)"),
+        ("column", ("matrix", "number", (4,)), r"must be \(fit, 4\)"),
+        ("column", ("size", "number", (1,)), r"has shape \(3,\), must be \(fit, 1\)"),
+        ("column", ("group", "number"), "is not a column"),
+        ("column", ("empty", "number"), r"has shape None, must be \(fit\)"),
+        ("column", ("scalar", "number"), r"has shape \(\), must be \(fit\)"),
+        ("column", ("wide", "number"), "is of type complex128, must be number"),
+        ("column", ("elsewhere", "number"), "is a link to another file"),
+        ("attribute", ("other",), "is missing"),
+        ("attribute", ("wide",), "has dtype complex128"),
+        ("text", ("number",), "is 3.5, must be text"),
+        ("text", ("list",), r"is \['x', 'y'\], must be text"),
     ],
 )
-def test_a_wrong_column_is_one_error_that_names_it(path, name, kind, shape, words):
+def test_a_wrong_column_or_attribute_is_one_error_that_names_it(path, method, arguments, words):
     with h5py.File(path, "a") as file:
         file.create_group("group")
         file["empty"] = h5py.Empty("f8")
         file["scalar"] = 1.0
         file["wide"] = np.ones(3, complex)
         file["elsewhere"] = h5py.ExternalLink("other.h5", "/size")
+        file.attrs["wide"] = 1j
     with opened_table(path, KIND) as table:
         with pytest.raises(RecordingError, match=words) as raised:
-            table.column(name, kind, shape)
-        assert raised.value.field == name
+            getattr(table, method)(*arguments)
+        assert raised.value.field == arguments[0]
         assert raised.value.file == str(path)
 
 
@@ -90,20 +95,6 @@ def test_more_rows_than_are_read_are_refused(path, monkeypatch):
         monkeypatch.setattr(limits, "FITS", 2)
         with pytest.raises(RecordingError, match="has 3 rows, at most 2 are read"):
             table.column("size", "number")
-
-
-def test_a_wrong_attribute_is_one_error_that_names_it(path):
-    with h5py.File(path, "a") as file:
-        file.attrs["wide"] = 1j
-    with opened_table(path, KIND) as table:
-        for name, words in (("other", "is missing"), ("wide", "has dtype complex128")):
-            with pytest.raises(RecordingError, match=words) as raised:
-                table.attribute(name)
-            assert raised.value.field == name
-        with pytest.raises(RecordingError, match=r"is 3.5, must be text"):
-            table.text("number")
-        with pytest.raises(RecordingError, match=r"is \['x', 'y'\], must be text"):
-            table.text("list")
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,8 @@
 
 The module of a command has the functions `add_arguments(parser)` and `run(arguments)`. `run`
 returns an `Outcome` and prints nothing on stdout. A command that writes files also has the function
-`outputs(arguments)`, which returns them for `etid.commands.outputs.check_outputs`. The first line
-of the module's docstring is the help of the command.
+`outputs(arguments)`, which returns each with the endings that its name may have; the files are
+checked before the work begins. The docstring of the module is the help of the command.
 """
 
 import dataclasses

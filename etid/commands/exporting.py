@@ -60,14 +60,15 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Write the target file."""
     source, target = arguments.source, arguments.target
     suffix = target.suffix.lower()
-    for name in ("path", "circuit"):
-        if getattr(arguments, name) is not None and suffix not in CIRCUITS:
-            raise ValueError(f"{target}: --{name} is only for {' and '.join(CIRCUITS)}")
-    for name in ("long", "all"):
-        if getattr(arguments, name) and suffix not in TABLES:
-            raise ValueError(f"{target}: --{name} is only for {' and '.join(TABLES)}")
-    if arguments.session_start is not None and suffix != ".nwb":
-        raise ValueError(f"{target}: --session-start is only for .nwb")
+    only = {
+        **dict.fromkeys(("path", "circuit"), CIRCUITS),
+        **dict.fromkeys(("long", "all"), TABLES),
+        "session_start": (".nwb",),
+    }
+    for name, suffixes in only.items():
+        if getattr(arguments, name) and suffix not in suffixes:
+            option = name.replace("_", "-")
+            raise ValueError(f"{target}: --{option} is only for {' and '.join(suffixes)}")
     if suffix == ".nwb":
         export_study(source, target, session_start=arguments.session_start)
     elif suffix in CIRCUITS:

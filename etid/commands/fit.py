@@ -6,7 +6,7 @@ import contextlib
 import math
 import pathlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -51,32 +51,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="number of poles of the driver, or auto: the least that the calibrations support; "
         "default 5, with --driver auto",
     )
-    parser.add_argument(
-        "--fix",
-        type=_known,
-        action="append",
-        default=[],
-        metavar="ELEMENT=VALUE",
-        help="known value of an element [SI], such as r_s=500; may be repeated",
-    )
-    parser.add_argument(
-        "--prior",
-        type=_known,
-        action="append",
-        default=[],
-        metavar="ELEMENT=VALUE,ERROR",
-        help="value of an element with its standard deviation [SI], such as r_s=500,50; may be "
-        "repeated",
-    )
-    parser.add_argument(
-        "--bound",
-        type=_bound,
-        action="append",
-        default=[],
-        metavar="ELEMENT=LOWER:UPPER",
-        help="bounds of an element [SI], such as r_s=100:2000, or r_s=100: without an upper one; "
-        "may be repeated",
-    )
+    for option, example, shape, purpose in (
+        ("--fix", "r_s=500", "ELEMENT=VALUE", "known value of an element [SI], such as r_s=500"),
+        ("--prior", "r_s=500,50", "ELEMENT=VALUE,ERROR",
+         "value of an element with its standard deviation [SI], such as r_s=500,50"),
+        ("--bound", "r_s=100:2000", "ELEMENT=LOWER:UPPER",
+         "bounds of an element [SI], such as r_s=100:2000, or r_s=100: without an upper one"),
+        ("--tolerance", "gain=1e-3", "NAME=VALUE",
+         "standard deviation of an error of the instrument: gain, r_load or crosstalk [relative], "
+         "or capacitance [F], such as gain=1e-3"),
+    ):  # fmt: skip
+        parser.add_argument(
+            option,
+            type=_written_as(option, example),
+            action="append",
+            default=[],
+            metavar=shape,
+            help=f"{purpose}; may be repeated",
+        )
     parser.add_argument(
         "--driver-drift",
         type=float,
@@ -85,17 +77,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="possible relative change of Z_th since its calibration, such as 0.01; default 0",
     )
     parser.add_argument(
-        "--tolerance",
-        type=_known,
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="standard deviation of an error of the instrument: gain, r_load or crosstalk "
-        "[relative], or capacitance [F], such as gain=1e-3; may be repeated",
-    )
-    parser.add_argument(
         "--plausible",
-        type=_plausible,
+        type=_written_as("--plausible", "300:300e3"),
         default=PLAUSIBLE,
         metavar="LOWEST:HIGHEST",
         help="range of |Z_th| at 1 kHz [ohm] that is accepted; default 300:300e3",
@@ -128,55 +111,44 @@ def _order(text: str) -> Order:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def _known(text: str) -> tuple[str, list[float]]:
-    """Name and numbers of --fix, --prior or --tolerance."""
-    name, _, numbers = text.partition("=")
-    try:
-        return name, [float(number) for number in numbers.split(",")]
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no known element; write --fix r_s=500 or --prior r_s=500,50"
-        ) from error
+def _written_as(option: str, example: str) -> Callable[[str], Any]:
+    """The type of an option that is written as an example: a name, and one number or two.
+
+    Two numbers have a comma or a colon between them. Both ends of a range may be open.
+    """
+    between = "," if "," in example else ":"
+    is_range, count = ":" in example, example.count(between) + 1
+
+    def parsed(text: str) -> tuple:
+        name, _, numbers = text.rpartition("=")
+        try:
+            values = [
+                None if is_range and not one else float(one) for one in numbers.split(between)
+            ]
+        except ValueError:
+            values = []
+        if len(values) != count or bool(name) != ("=" in example):
+            raise argparse.ArgumentTypeError(f"{text!r} cannot be read; write {option} {example}")
+        value = values[0] if count == 1 else tuple(values)
+        return (name, value) if name else tuple(values)
+
+    return parsed
 
 
-def _ends(text: str, example: str) -> list[float | None]:
-    """Both ends of a range; None where there is none."""
-    try:
-        low, high = (float(end) if end else None for end in text.split(":"))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no range; write {example}") from error
-    return [low, high]
-
-
-def _bound(text: str) -> tuple[str, list[float | None]]:
-    """Name and both bounds of an element, from --bound."""
-    name, _, ends = text.partition("=")
-    return name, _ends(ends, "--bound r_s=100:2000 or r_s=100:")
-
-
-def _plausible(text: str) -> tuple[float | None, ...]:
-    """The value of --plausible; the function that gets it checks the range."""
-    return tuple(_ends(text, "--plausible 300:300e3"))
-
-
-def _several(option: str, known: list[tuple[str, list[Any]]], count: int) -> dict[str, Any]:
-    """The known elements of an option by name; each has one number, or value and error."""
-    for name, numbers in known:
-        if len(numbers) != count:
-            right = "--fix r_s=500" if count == 1 else "--prior r_s=500,50"
-            raise ValueError(f"{option} {name} has {len(numbers)} numbers; write {right}")
+def _by_name(option: str, known: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The values of an option that may be repeated, by element."""
     names = [name for name, _ in known]
     if len(set(names)) < len(names):
         raise ValueError(f"{option} names an element twice: {', '.join(names)}")
-    return {name: numbers[0] if count == 1 else tuple(numbers) for name, numbers in known}
+    return dict(known)
 
 
-def _instrument(told: list[tuple[str, list[Any]]]) -> Instrument | None:
+def _instrument(told: list[tuple[str, float]]) -> Instrument | None:
     """The tolerances of --tolerance."""
     for name, _ in told:
         if name not in TOLERANCES:
             raise ValueError(f"--tolerance knows no {name!r}; write {', '.join(TOLERANCES)}")
-    return Instrument(**_several("--tolerance", told, 1)) if told else None
+    return Instrument(**_by_name("--tolerance", told)) if told else None
 
 
 def _workers(text: str) -> int:
@@ -201,9 +173,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ValueError("--joint identifies the driver itself; remove --driver, or --joint")
     options = {
         "circuit": None if arguments.circuit is None else arguments.circuit(),
-        "fixed": _several("--fix", arguments.fix, 1),
-        "prior": _several("--prior", arguments.prior, 2),
-        "bounds": _several("--bound", arguments.bound, 2),
+        "fixed": _by_name("--fix", arguments.fix),
+        "prior": _by_name("--prior", arguments.prior),
+        "bounds": _by_name("--bound", arguments.bound),
         "plausible": arguments.plausible,
         "instrument": _instrument(arguments.tolerance),
     }

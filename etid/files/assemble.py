@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from etid.files.channel import Channel, Unit, located
+from etid.files.channel import UNITS, Channel, located, parse_unit
 from etid.files.clock import sample_rate
-from etid.files.mapping import KINDS, PAUSES, Plan, Signal, unit_of
-from etid.recordings import limits
+from etid.files.mapping import KINDS, PAUSES, Plan, Signal
 from etid.recordings.fields import SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, RecordingError
 from etid.recordings.splitting import firing, split
@@ -103,22 +102,15 @@ def sources_of(
         by: Source of the plan, for errors: `mapping` or `command`.
     """
     channels: dict[str, Channel] = {}
-    units: dict[str, tuple[Unit, str]] = {}
+    used: dict[str, Used] = {}
+    factors: dict[str, float] = {}  # SI units per unit of the channel
     for name, signal in plan.signals.items():
         with located("", field=name):
             channels[name] = channel(signal.channel)
-        units[name] = _unit(name, signal, channels[name].unit)
-    for name, own in channels.items():
-        if own.length > limits.SAMPLES or (len(own.shape) == 2 and own.shape[0] > limits.TRIALS):
-            raise RecordingError(
-                f"channel {own.name!r} has shape {own.shape}; etid reads at most {limits.TRIALS} "
-                f"trials of {limits.SAMPLES} samples",
-                field=name,
-                remedy="Split the channel",
-            )
+        used[name], factors[name] = _used(name, signal, channels[name].unit, by)
     rows = _rows(plan.signals, channels)
     length = channels["v_out"].length
-    rate, rate_by = sample_rate(plan, channels, units, by)
+    rate, rate_by = sample_rate(plan, channels, factors.get("time", 1.0), by)
     common = metadata_from(**{**plan.fields, "sample_rate": rate, "trial": "", "path": plan.path})
     trials = rows["v_out"]
     stacked = len(channels["v_out"].shape) == 2 and not isinstance(plan.signals["v_out"].rows, int)
@@ -132,8 +124,7 @@ def sources_of(
         )
     parts, electrodes = _parts(plan, channels, channel, common)
     several = stacked or bool(parts)
-    trials = list(range(len(parts))) if parts else trials
-    if electrodes:  # the trials are the rounds of each
+    if parts:  # the trials are the rounds of each electrode
         trials = [electrodes[:i].count(one) for i, one in enumerate(electrodes)]
     labels = _labels(plan.fields.get("trial"), trials, several)
     sources: dict[str, AbstractSource] = {}
@@ -142,30 +133,20 @@ def sources_of(
         layout: list[Layout] = []
         for name in SIGNALS:
             if name in channels:
-                factor = units[name][0].factor / (plan.signals[name].scale or 1.0)
                 part = channels[name].part(parts[index]) if parts else channels[name]
                 trial = rows[name][index if len(rows[name]) > 1 else 0]
                 with located("", field=name):
-                    layout.append(_layout(name, part, factor))
+                    layout.append(_layout(name, part, factors[name]))
                 records[name] = part, trial
         path = f"{plan.path}/{index}" if several or plan.path in KINDS else plan.path
-        own = {"trial": label, "path": path}
-        if electrodes:
+        own = {"trial": label}
+        if parts and electrodes[index]:
             own["electrode"] = electrodes[index]
-            own["path"] = path = f"{plan.path}/{electrodes[index]}/{trials[index]}"
-        metadata = metadata_from(**{**vars(common), **own})
+            path = f"{plan.path}/{electrodes[index]}/{trials[index]}"
+        metadata = metadata_from(**{**vars(common), **own, "path": path})
         th = records.get("v_th")
         unloaded = (file, path) if th is None else (file, th[0].name, th[1])
         sources[path] = _Source(tuple(layout), unloaded, file, metadata, records)
-    used = {
-        name: Used(
-            signal.channel,
-            signal.unit or channels[name].unit.strip() or signal.implied,
-            units[name][1],
-            signal.scale or 1.0,
-        )
-        for name, signal in plan.signals.items()
-    }
     samples = parts[0].stop - parts[0].start if parts else length
     notices = tuple(dict.fromkeys(own.notice for own in channels.values() if own.notice))
     return sources, Imported(
@@ -192,9 +173,9 @@ def _parts(
     channel: Callable[[str], Channel],
     common: Metadata,
 ) -> tuple[list[slice], list[str]]:
-    """The parts of one long record, and their electrodes if these fire in turn.
+    """The parts of one long record, and the electrode of each, which is empty if all are of one.
 
-    Both are empty if the record is not to be split.
+    Both lists are empty if the record is not to be split.
     """
     if not plan.split:
         return [], []
@@ -233,23 +214,55 @@ def _parts(
             field="electrode",
             remedy="Name them in the order in which they fire, and record whole rounds",
         )
-    return parts, [order[i % len(order)] for i in range(len(parts))] if order else []
+    return parts, [order[i % len(order)] if order else "" for i in range(len(parts))]
 
 
-def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
-    """Unit of a signal and its source; an error if the signal cannot have this unit."""
-    unit, by = unit_of(name, signal, said)
-    wanted = {"time": "second", "current": "ampere"}.get(name, "volt")
-    over_a_shunt = name == "current" and unit.si == "volt" and signal.scale is not None
-    if unit.si != wanted and not over_a_shunt:
+def _used(name: str, signal: Signal, said: str, by: str) -> tuple[Used, float]:
+    """The meaning of a channel's values, and the size of 1 in its SI unit.
+
+    Args:
+        name: Name of the signal.
+        signal: The signal in the plan.
+        said: Unit of the channel in the spelling of the file; empty if the file names none.
+        by: Source of the plan. A command that names no unit means volt, ampere or second.
+    """
+    field, where = f"{name}.unit", f"of channel {signal.channel!r}"
+    ours, theirs = parse_unit(signal.unit), parse_unit(said)
+    if said and theirs is None:
         raise RecordingError(
-            f"channel {signal.channel!r} is in {unit.si} ({by}), must be in {wanted}",
-            field=f"{name}.unit",
+            f"the file says {said!r} {where}, which is neither volts, amperes nor seconds",
+            field=field,
+            remedy="Correct it in the file",
+        )
+    if ours and theirs and ours != theirs:
+        raise RecordingError(
+            f"the mapping says {signal.unit!r} {where}, the file says {said!r}",
+            field=field,
+            remedy="Correct the one that is wrong",
+        )
+    wanted = {"time": "s", "current": "A"}.get(name, "V")
+    unit, text = ours or theirs, signal.unit or said
+    unit_by = " and ".join(["file"] * (theirs is not None) + ["mapping"] * (ours is not None))
+    if unit is None and by == "command":
+        unit, text, unit_by = UNITS[wanted], wanted, by
+    if unit is None:
+        raise RecordingError(
+            f"is not given {where}, the file does not contain it, and it is not guessed",
+            field=field,
+            remedy=f'Write {name} = {{channel = "{signal.channel}", unit = "…"}}',
+        )
+    over_a_shunt = name == "current" and unit.si == "volt"
+    if unit.si != UNITS[wanted].si and not (over_a_shunt and signal.scale is not None):
+        raise RecordingError(
+            f"channel {signal.channel!r} is in {unit.si} ({unit_by}), must be in "
+            f"{UNITS[wanted].si}",
+            field=field,
             remedy="Add a scale in volts per ampere, if this voltage represents the current"
-            if name == "current" and unit.si == "volt"
+            if over_a_shunt
             else "Name another channel",
         )
-    return unit, by
+    scale = signal.scale or 1.0
+    return Used(signal.channel, text, unit_by, scale), unit.factor / scale
 
 
 def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dict[str, list[int]]:

@@ -1,14 +1,17 @@
 """Named channels of a file of another format; their samples are read later."""
 
+import contextlib
 import dataclasses
 import functools
+import pathlib
 import re
-from collections.abc import Callable, Iterable, Iterator
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from etid.recordings import errors
+from etid.recordings import errors, limits
 from etid.recordings.errors import RecordingError
 
 BLOCK = 1 << 20  # [samples] size of a block in memory, 8 MB of real numbers
@@ -33,7 +36,8 @@ class Channel:
         notice: What a user must know of the samples although they are read; usually empty.
 
     Raises:
-        RecordingError: The file contradicts itself: in the unit, or in the number of samples.
+        RecordingError: The channel is empty, too large, or not of real numbers. Or the file
+            contradicts itself: in the unit, or in the number of samples.
     """
 
     name: str
@@ -48,6 +52,19 @@ class Channel:
     notice: str = ""
 
     def __post_init__(self) -> None:
+        if self.dtype.kind not in "iuf" or self.dtype.itemsize > 8:
+            raise RecordingError(
+                f"{self.name!r} is a {self.dtype} array, must be an array of real numbers of at "
+                "most 64 bits"
+            )
+        if 0 in self.shape:
+            raise RecordingError(f"{self.name!r} is empty, of shape {self.shape}")
+        if self.length > limits.SAMPLES or max(self.shape[:-1], default=0) > limits.TRIALS:
+            raise RecordingError(
+                f"channel {self.name!r} has shape {self.shape}; etid reads at most {limits.TRIALS} "
+                f"trials of {limits.SAMPLES} samples",
+                remedy="Split the channel",
+            )
         unit = one_unit(self.name, self.unit, with_unit(self.name)[1])
         object.__setattr__(self, "unit", unit)
         if self.length < self.declared:
@@ -85,10 +102,6 @@ class Channel:
         return dataclasses.replace(self, name=name, shape=shape, read=read, declared=0)
 
 
-def _nothing(names: Iterable[str]) -> None:
-    del names
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Contents:
     """An open file of another format.
@@ -101,7 +114,7 @@ class Contents:
 
     names: tuple[str, ...]
     channel: Callable[[str], Channel]
-    prepare: Callable[[Iterable[str]], None] = _nothing
+    prepare: Callable[[Iterable[str]], None] = lambda names: None
 
 
 def listed(names: Iterable[str]) -> str:
@@ -126,34 +139,52 @@ def chosen(names: Iterable[str], name: str, field: str) -> None:
         )
 
 
-def real(name: str, dtype: np.dtype, shape: tuple[int, ...]) -> None:
-    """Raise an error if an array is empty or does not hold real numbers."""
-    if dtype.kind not in "iuf" or dtype.itemsize > 8:
-        raise RecordingError(
-            f"{name!r} is a {dtype} array, must be an array of real numbers of at most 64 bits"
-        )
-    if 0 in shape:
-        raise RecordingError(f"{name!r} is empty, of shape {shape}")
+def array_channel(name: str, array: np.ndarray, **fields: Any) -> Channel:
+    """The channel of an array in memory or mapped from a file, (time,) or (trial, time).
 
-
-def array_channel(name: str, array: np.ndarray) -> Channel:
-    """The channel of an array in memory, (time,) or (trial, time)."""
-    real(name, array.dtype, array.shape)
+    Args:
+        name: Name of the channel.
+        array: The stored samples.
+        **fields: Other fields of `Channel`.
+    """
 
     def read(trial: int, start: int, stop: int) -> np.ndarray:
-        return (array if array.ndim == 1 else array[trial])[start:stop]
+        return np.asarray(array if array.ndim == 1 else array[trial])[start:stop]
 
-    return Channel(name, array.shape, array.dtype, read)
+    return Channel(name, array.shape, array.dtype, read, **fields)
 
 
-def spooled_channel(name: str, file: BinaryIO, count: int, **fields: Any) -> Channel:
-    """The channel of real numbers in a temporary file; `fields` are others of `Channel`."""
+@contextlib.contextmanager
+def spooled(
+    names: Iterable[str],
+    folder: pathlib.Path,
+    write: Callable[[Mapping[str, BinaryIO]], str],
+    about: Callable[[str], Mapping[str, Any]],
+) -> Iterator[Contents]:
+    """Contents of a file of text: `prepare` copies the needed columns to temporary files.
 
-    def read(_: int, start: int, stop: int) -> np.ndarray:
-        file.seek(8 * start)
-        return np.frombuffer(file.read(8 * (stop - start)))
+    Args:
+        names: Names of the columns.
+        folder: Folder of the temporary files.
+        write: Function that writes the numbers of columns to the files of these names, as float64,
+            and returns the notice on all channels.
+        about: Function that returns other fields of the channel of a name.
+    """
+    files: dict[str, BinaryIO] = {}
+    notice = ""
+    with contextlib.ExitStack() as stack:
 
-    return Channel(name, (count,), np.dtype(np.float64), read, **fields)
+        def prepare(wanted: Iterable[str]) -> None:
+            nonlocal notice
+            for name in wanted:
+                files[name] = stack.enter_context(tempfile.TemporaryFile(dir=folder))
+            notice = write(files)
+
+        def channel(name: str) -> Channel:
+            numbers = np.memmap(files[name], np.float64, "r")
+            return array_channel(name, numbers, notice=notice, **about(name))
+
+        yield Contents(tuple(names), channel, prepare)
 
 
 def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from etid.files.channel import Channel, Unit, located
+from etid.files.channel import Channel, located
 from etid.files.mapping import Plan
 from etid.recordings.recording import RecordingError
 
@@ -12,9 +12,16 @@ QUARTZ = 1e-4  # largest relative error of a quartz clock, so of a measured rate
 
 
 def sample_rate(
-    plan: Plan, channels: Mapping[str, Channel], units: Mapping[str, tuple[Unit, str]], by: str
+    plan: Plan, channels: Mapping[str, Channel], factor: float, by: str
 ) -> tuple[float, str]:
-    """Sample rate [Hz] of a recording, and the source of this rate."""
+    """Sample rate [Hz] of a recording, and the source of this rate.
+
+    Args:
+        plan: Plan of the recording.
+        channels: Channels of its signals.
+        factor: Seconds per unit of the channel of the time.
+        by: Source of the plan.
+    """
     said = {
         plan.signals[name].channel: channel.sample_rate
         for name, channel in channels.items()
@@ -32,7 +39,7 @@ def sample_rate(
     if ours is None and "time" in channels:
         signal = plan.signals["time"]
         with located("", field="time"):
-            ours = _clock(channels["time"], units["time"][0].factor, channels["v_out"].length)
+            ours = _clock(channels["time"], factor, channels["v_out"].length)
         by = f"time {signal.channel!r}"
     if ours is None:
         if theirs is None:

@@ -21,7 +21,7 @@ import tomli_w
 from etid.files.assemble import Imported
 from etid.files.channel import located
 from etid.files.importing import channels_of, converted
-from etid.files.pattern import Pattern
+from etid.files.pattern import pattern
 from etid.recordings.errors import RecordingError
 from etid.recordings.fields import LABELS, real
 from etid.recordings.replacing import replacing
@@ -125,21 +125,20 @@ def labelled(
     """
     if not root.is_dir():
         raise RecordingError("there is no such folder", file=str(root), remedy="Check the path")
-    compiled = [Pattern(pattern, ("r_load",)) for pattern in patterns]
+    expressions = [pattern(text, ("r_load",)) for text in patterns]
     known = _table(root)
-    depth = max(pattern.count("/") for pattern in patterns)
+    deep = any("/" in text for text in patterns)
     files = sorted(
         path.relative_to(root).as_posix()
-        for path in root.glob("**/*" if depth else "*")
+        for path in root.glob("**/*" if deep else "*")
         if path.is_file() and path.name != TABLE
     )
     found: dict[str, dict[str, Any]] = {}
     for file in files:
-        matches = (pattern.labels(file) for pattern in compiled)
-        match = next((one for one in matches if one is not None), None)
+        match = next(filter(None, (each.fullmatch(file) for each in expressions)), None)
         if match is None and file not in known:
             continue
-        of: dict[str, Any] = {} if match is None else {**match}
+        of: dict[str, Any] = {} if match is None else match.groupdict()
         if "r_load" in of:
             of["r_load"] = resistance(of["r_load"], str(root / file))
         if file in known:
@@ -154,14 +153,11 @@ def labelled(
             f"none of its {len(files)} files matches {' or '.join(map(repr, patterns))}",
             file=str(root),
             field="labels",
-            remedy="Write the names as they are, with labels in braces" + _example(files),
+            remedy="Write the names as they are, with labels in braces"
+            + (f"; the first file is {files[0]!r}" if files else ""),
         )
     calibrations_first = dict(sorted(found.items(), key=lambda one: "r_load" not in one[1]))
     return calibrations_first, [file for file in files if file not in found]
-
-
-def _example(files: Sequence[str]) -> str:
-    return f"; the first file is {files[0]!r}" if files else ""
 
 
 def resistance(text: str, file: str) -> float:

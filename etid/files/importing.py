@@ -9,7 +9,7 @@ import contextlib
 import dataclasses
 import os
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -20,11 +20,11 @@ from etid.files.channel import Channel, Contents, located
 from etid.files.mapping import (
     CHANNELS,
     KINDS,
-    each_channel,
     files_of,
     of_files,
     plans,
     read_mapping,
+    recordings_of,
 )
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
 from etid.recordings.errors import optional, require_file
@@ -55,8 +55,7 @@ def import_file(
     """Convert one or several files of other formats into one etid file.
 
     - `.csv`: comma-separated columns with a header line, one trial.
-    - `.mat`: variables of shape (time,) or (trial, time). `a.b` is field b of structure a. MATLAB
-      files before version 7.3 need `pip install etid[matlab]`.
+    - `.mat`: variables of shape (time,) or (trial, time). `a.b` is field b of structure a.
     - `.tdms`: channels `group/channel` of NI files. They need `pip install etid[tdms]`.
     - `.abf`: ADC channels of Axon files; sweeps become trials. They need `pip install etid[abf]`.
     - `.npz`: arrays of shape (time,) or (trial, time). If the arrays are those of
@@ -173,7 +172,6 @@ def converted(
     Raises:
         RecordingError: As `import_file`.
     """
-    implied = {"v_th": "V", "v_out": "V", "current": "A", "time": "s"} if by == "command" else {}
     folder = pathlib.Path(os.fspath(target)).parent
     if not folder.is_dir():
         raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
@@ -199,12 +197,10 @@ def converted(
                     own = written if one.suffix.lower() == ".csv" else {}
                     return files.enter_context(READERS[one.suffix.lower()](one, folder, **own))
 
-                contents = with_others(opened(path), told, opened)
+                contents = opened(path)
                 with located(place + file):
-                    name = path.stem if len(said) > 1 else ""
-                    planned = plans(
-                        each_channel(told, contents.names), contents.names, implied, name
-                    )
+                    contents = with_others(contents, told, opened)
+                    planned = plans(told, contents.names, path.stem if len(said) > 1 else "")
                 contents.prepare({name for plan in planned for name in plan.channels})
                 for plan in planned:
                     with located(file, path=plan.path if len(planned) > 1 else ""):
@@ -256,7 +252,8 @@ def with_others(
     current folder. So V_th may be recorded once for all trials.
     """
     others: dict[str, Contents] = {}
-    for name in _named(mapping):
+    signals = [said.get(name) for said in (mapping, *recordings_of(mapping)) for name in CHANNELS]
+    for name in [str(of.get("channel")) for of in signals if isinstance(of, Mapping)]:
         file = name.rpartition(":")[0]
         if name not in contents.names and file not in others and pathlib.Path(file).is_file():
             with located(file):
@@ -280,16 +277,6 @@ def with_others(
 
     foreign = (f"{file}:{name}" for file, other in others.items() for name in other.names)
     return Contents((*contents.names, *foreign), channel, prepare)
-
-
-def _named(mapping: Mapping[str, Any]) -> Iterator[str]:
-    """The names of channels in a mapping; `plans` checks its form."""
-    tables = mapping.get("recording", [])
-    for table in [mapping, *(tables if isinstance(tables, list) else [tables])]:
-        for signal in CHANNELS:
-            said = table.get(signal) if isinstance(table, Mapping) else None
-            if isinstance(said, Mapping) and isinstance(said.get("channel"), str):
-                yield said["channel"]
 
 
 # --- Measured impedances --------------------------------------------------------------------------

@@ -5,7 +5,6 @@ first `[[recording]]` apply to all of them.
 """
 
 import dataclasses
-import math
 import os
 import pathlib
 import re
@@ -13,11 +12,11 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from etid.files.channel import UNITS, Unit, chosen, listed, parse_unit
-from etid.files.pattern import Pattern
+from etid.files.channel import UNITS, chosen, listed, parse_unit
+from etid.files.pattern import pattern
 from etid.recordings import limits
-from etid.recordings.fields import DECLARED, LABELS, SIGNALS, check_names, tidy_path
-from etid.recordings.recording import RecordingError
+from etid.recordings.errors import RecordingError, located
+from etid.recordings.fields import DECLARED, LABELS, SIGNALS, check_names, real, tidy_path
 
 CHANNELS = (*SIGNALS, "time")
 FIELDS = (*DECLARED, "scale", "split")
@@ -36,15 +35,12 @@ class Signal:
             not name it.
         scale: Volts of the record per volt at the terminal; for the current: volts per ampere.
         rows: Rows of the channel to use as trials, counted from 0; None: all rows.
-        implied: Unit if neither the mapping nor the file names one; empty if a missing unit is an
-            error.
     """
 
     channel: str
     unit: str = ""
     scale: float | None = None
     rows: tuple[int, ...] | int | None = None
-    implied: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +101,7 @@ def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def files_of(mapping: Mapping[str, Any]) -> list[str]:
     """The files of a mapping, in its order."""
-    names = [table.get("file") for table in _tables(mapping)]
+    names = [table.get("file") for table in recordings_of(mapping)]
     if not names or not all(isinstance(name, str) for name in names):
         raise RecordingError(
             "is not given for each recording", field="file", remedy="The source is a folder"
@@ -115,7 +111,7 @@ def files_of(mapping: Mapping[str, Any]) -> list[str]:
 
 def of_files(mapping: Mapping[str, Any], names: Sequence[str]) -> list[Mapping[str, Any]]:
     """The part of a mapping for each file: the recordings whose key `file` has its name."""
-    tables = _tables(mapping)
+    tables = recordings_of(mapping)
     if len(names) == 1 and not any("file" in table for table in tables):
         return [mapping]
     common = {key: value for key, value in mapping.items() if key != "recording"}
@@ -138,7 +134,7 @@ def of_files(mapping: Mapping[str, Any], names: Sequence[str]) -> list[Mapping[s
     return [{**common, "recording": tables_of[name]} for name in names]
 
 
-def _tables(mapping: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def recordings_of(mapping: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """The recordings of a mapping; empty if its keys are those of one recording."""
     tables = mapping.get("recording", [])
     tables = [tables] if isinstance(tables, Mapping) else tables
@@ -149,87 +145,72 @@ def _tables(mapping: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return tables
 
 
-def plans(
-    mapping: Mapping[str, Any],
-    names: Sequence[str],
-    implied: Mapping[str, str],
-    name: str = "",
-) -> list[Plan]:
+def plans(mapping: Mapping[str, Any], names: Sequence[str], name: str = "") -> list[Plan]:
     """Plans of the recordings of a mapping.
 
     Args:
         mapping: Content of a mapping, from `read_mapping`.
         names: Names of the channels of the file; the mapping may use only these.
-        implied: Unit of each signal if neither the mapping nor the file names one.
         name: Name below `loaded` or `calibration` of a recording without a path.
     """
-    tables = _tables(mapping)
+    tables = recordings_of(mapping)
     common = {key: value for key, value in mapping.items() if key != "recording"}
     check_names(common, (*CHANNELS, *FIELDS, "recording" if tables else "path"), _KEY)
+    recordings = [
+        said for table in tables or [{}] for said in _of_channels({**common, **table}, names)
+    ]
     planned: list[Plan] = []
-    for table in tables or [{}]:
-        said = {**common, **table}
+    for said in recordings:
         check_names(said, (*CHANNELS, *FIELDS, "path"), _KEY)
         path = tidy_path(said.get("path", ""))
-        if not path and len(tables) > 1:
+        if not path and len(recordings) > 1:
             raise RecordingError(
                 "is not given", field="path", remedy="Give each [[recording]] a path of its own"
             )
         path = path or tidy_path(f"{KINDS[said.get('r_load') is not None]}/{name}")
         if any(plan.path == path for plan in planned):
             raise RecordingError("two recordings have this path", path=path)
-        try:
-            planned.append(_plan(path, said, names, implied))
-        except RecordingError as error:
-            raise error.located(path=path if len(tables) > 1 else "") from None
+        with located(path=path if len(recordings) > 1 else ""):
+            planned.append(_plan(path, said, names))
     return planned
 
 
-def each_channel(mapping: Mapping[str, Any], names: Sequence[str]) -> Mapping[str, Any]:
-    """A mapping with a recording for each channel that a pattern such as `CH{electrode}` matches.
+def _of_channels(said: Mapping[str, Any], names: Sequence[str]) -> list[Mapping[str, Any]]:
+    """A recording for each channel that a pattern such as `CH{electrode}` matches.
 
-    Args:
-        mapping: Content of a mapping, from `read_mapping`.
-        names: Names of the channels of the file.
-
-    Raises:
-        RecordingError: No channel matches, or a second pattern has no channel for a label.
+    Without a pattern there is one recording. Other patterns have the labels of that of `v_out`.
     """
-    common = {key: value for key, value in mapping.items() if key != "recording"}
-    tables: list[Mapping[str, Any]] = []
-    for table in _tables(mapping) or [{}]:
-        said = {**common, **table}
-        patterns = {
-            name: said[name]["channel"]
-            for name in CHANNELS
-            if isinstance(said.get(name), Mapping)
-            and any(f"{{{label}}}" in str(said[name].get("channel")) for label in LABELS)
-        }
-        if "v_out" not in patterns:
-            tables.append(table)
-            continue
-        by = Pattern(patterns["v_out"])
-        matches = [labels for name in names if (labels := by.labels(name)) is not None]
-        if not matches:
-            raise RecordingError(
-                f"no channel matches {by.text!r}; the channels are {listed(names)}", field="v_out"
-            )
-        base = tidy_path(said.get("path", "")) or KINDS[0]
-        for labels in matches:
-            channels = {
+    patterns = {
+        name: said[name]["channel"]
+        for name in CHANNELS
+        if isinstance(said.get(name), Mapping)
+        and any(f"{{{label}}}" in str(said[name].get("channel")) for label in LABELS)
+    }
+    if "v_out" not in patterns:
+        return [said]
+    expression = pattern(patterns["v_out"])
+    matches = [match.groupdict() for match in map(expression.fullmatch, names) if match]
+    if not matches:
+        raise RecordingError(
+            f"no channel matches {patterns['v_out']!r}; the channels are {listed(names)}",
+            field="v_out",
+        )
+    base = tidy_path(said.get("path", "")) or KINDS[0]
+    return [
+        {
+            **said,
+            **labels,
+            **{
                 name: {**said[name], "channel": text.format(**labels)}
                 for name, text in patterns.items()
-            }
-            path = "/".join([base, *labels.values()])
-            tables.append({**table, **labels, **channels, "path": path})
-    if not any(isinstance(table.get("v_out"), Mapping) for table in tables):
-        return mapping
-    return {**common, "recording": tables}
+            },
+            "path": "/".join([base, *labels.values()]),
+        }
+        for labels in matches
+    ]
 
 
-def _plan(
-    path: str, said: Mapping[str, Any], names: Sequence[str], implied: Mapping[str, str]
-) -> Plan:
+def _plan(path: str, said: Mapping[str, Any], names: Sequence[str]) -> Plan:
     by_current = "current" in said and "r_load" not in said  # a load that needs no v_th
     for name in ("v_th", "v_out", "pulse_rate"):
         if name not in said and not (name == "v_th" and by_current):
@@ -237,9 +218,7 @@ def _plan(
             hint = "; or name the measured current, with --current" if name == "v_th" else ""
             raise _missing(name, known, hint)
     signals = {
-        name: _signal(name, said[name], said.get("scale"), implied.get(name, ""))
-        for name in CHANNELS
-        if name in said
+        name: _signal(name, said[name], said.get("scale")) for name in CHANNELS if name in said
     }
     for name, signal in signals.items():
         chosen(names, signal.channel, name)
@@ -298,7 +277,7 @@ def _missing(name: str, known: str = "", hint: str = "") -> RecordingError:
     )
 
 
-def _signal(name: str, said: Any, common: Any, implied: str) -> Signal:
+def _signal(name: str, said: Any, common: Any) -> Signal:
     if not isinstance(said, Mapping) or not isinstance(said.get("channel"), str):
         raise RecordingError(
             "names no channel", field=name, remedy=f'Write {name} = {{channel = "…", unit = "…"}}'
@@ -311,63 +290,22 @@ def _signal(name: str, said: Any, common: Any, implied: str) -> Signal:
             field=f"{name}.unit",
             remedy=f"Units are {', '.join(key for key in UNITS if len(key) < 3)} and their names",
         )
-    scale = _number(f"{name}.scale", said.get("scale"))
+    scale = _scale(f"{name}.scale", said.get("scale"))
     if scale is None and name in ("v_th", "v_out"):
-        scale = _number("scale", common)
-    return Signal(said["channel"], unit, scale, _rows(f"{name}.rows", said.get("rows")), implied)
+        scale = _scale("scale", common)
+    rows = said.get("rows")
+    every = rows if isinstance(rows, list) else [rows]
+    if rows is not None and (not every or any(type(one) is not int or one < 0 for one in every)):
+        raise RecordingError(
+            f"is {rows!r}, must be one row number or a list, counted from 0", field=f"{name}.rows"
+        )
+    return Signal(said["channel"], unit, scale, tuple(rows) if isinstance(rows, list) else rows)
 
 
-def _rows(field: str, value: Any) -> tuple[int, ...] | int | None:
+def _scale(field: str, value: Any) -> float | None:
     if value is None:
         return None
-    if _is_row(value):
-        return int(value)
-    if isinstance(value, list) and value and all(map(_is_row, value)):
-        return tuple(value)
-    raise RecordingError(
-        f"is {value!r}, must be one row number or a list, counted from 0", field=field
-    )
-
-
-def _is_row(row: object) -> bool:
-    return isinstance(row, int) and not isinstance(row, bool) and row >= 0
-
-
-def _number(field: str, value: Any) -> float | None:
-    if value is None:
-        return None
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or value == 0:
-        raise RecordingError(f"is {value!r}, must be a finite number and not 0", field=field)
-    return float(value)
-
-
-def unit_of(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
-    """Unit of a channel's values, and the source of this unit."""
-    field = f"{name}.unit"
-    ours, theirs = parse_unit(signal.unit), parse_unit(said)
-    where = f"of channel {signal.channel!r}"
-    if said and theirs is None:
-        raise RecordingError(
-            f"the file says {said!r} {where}, which is neither volts, amperes nor seconds",
-            field=field,
-            remedy="Correct it in the file",
-        )
-    if ours and theirs and ours != theirs:
-        raise RecordingError(
-            f"the mapping says {signal.unit!r} {where}, the file says {said!r}",
-            field=field,
-            remedy="Correct the one that is wrong",
-        )
-    if ours:
-        return ours, "file and mapping" if theirs else "mapping"
-    if theirs:
-        return theirs, "file"
-    implied = parse_unit(signal.implied)
-    if implied:
-        return implied, "command"
-    raise RecordingError(
-        f"is not given {where}, the file does not contain it, and it is not guessed",
-        field=field,
-        remedy=f'Write {name} = {{channel = "{signal.channel}", unit = "…"}}',
-    )
+    scale = real(field, value)
+    if scale == 0:
+        raise RecordingError("is 0, must be another number", field=field)
+    return scale

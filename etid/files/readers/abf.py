@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, rate_of
+from etid.files.channel import Channel, Contents, array_channel, rate_of
 from etid.recordings.errors import RecordingError, optional
 
 
@@ -52,15 +52,9 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     def channel(name: str) -> Channel:
         index = names.index(name)
         codes = dtype.kind == "i"
-
-        def read(sweep: int, start: int, stop: int) -> np.ndarray:
-            return np.array(stored[sweep, start:stop, index])
-
-        return Channel(
+        return array_channel(
             name,
-            (sweeps, length) if sweeps > 1 else (length,),
-            dtype,
-            read,
+            stored[:, :, index] if sweeps > 1 else stored[0, :, index],
             unit=abf.adcUnits[index].strip("? \0"),
             sample_rate=rate,
             conversion=abf._dataGain[index] if codes else 1.0,

@@ -18,21 +18,12 @@ import csv
 import dataclasses
 import itertools
 import pathlib
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 
-from etid.files.channel import (
-    Channel,
-    Contents,
-    one_unit,
-    parse_unit,
-    rate_of,
-    spooled_channel,
-    with_unit,
-)
+from etid.files.channel import Contents, one_unit, parse_unit, rate_of, spooled, with_unit
 from etid.recordings.recording import RecordingError
 
 ROWS = 1 << 16  # rows of text in memory at a time
@@ -72,23 +63,22 @@ class Dialect:
         cells = [cell.strip("()[] ") for cell in cells]
         if len(cells) > count or not any(map(parse_unit, cells)):
             return None
-        found = ["" if self.is_number(cell) else cell for cell in cells]
+        found = ["" if self.number(cell) is not None else cell for cell in cells]
         return (*found, *[""] * (count - len(found)))
 
-    def is_number(self, cell: str) -> bool:
-        """Whether a cell is a number with this decimal sign."""
+    def number(self, cell: str) -> float | None:
+        """The number of a cell with this decimal sign; None if the cell holds none."""
+        if self.decimal != "." and "." in cell:
+            return None
         try:
-            float(cell.replace(self.decimal, "."))
+            return float(cell.replace(self.decimal, "."))
         except ValueError:
-            return False
-        return self.decimal == "." or "." not in cell
+            return None
 
     def are_numbers(self, cells: Sequence[str]) -> bool:
         """Whether all cells are numbers; empty ones at the end do not count."""
-        filled = len(cells)
-        while filled and not cells[filled - 1]:
-            filled -= 1
-        return filled > 0 and all(map(self.is_number, cells[:filled]))
+        filled = list(itertools.dropwhile(lambda cell: not cell, reversed(cells)))
+        return bool(filled) and all(self.number(cell) is not None for cell in filled)
 
 
 def spool(
@@ -146,7 +136,8 @@ def _rows(
             cells = dialect.cells(line)
             if least is None:
                 least = max(
-                    (i for i, cell in enumerate(cells, 1) if dialect.is_number(cell)), default=1
+                    (i for i, cell in enumerate(cells, 1) if dialect.number(cell) is not None),
+                    default=1,
                 )
             if any(cells[width:]) or len(cells) < least:
                 raise RecordingError(
@@ -187,7 +178,7 @@ DIALECT = tuple(field.name for field in dataclasses.fields(Dialect))
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Contents]:
-    """Columns of a table; `prepare` copies the needed columns to temporary binary files.
+    """Columns of a table.
 
     Args:
         path: The table.
@@ -197,29 +188,23 @@ def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Co
     dialect = Dialect(**told)
     if not told:
         _refuse_another(path)
-    with contextlib.ExitStack() as files:
-        with path.open(newline="", encoding=dialect.encoding) as text:
-            names, units, skipped = _header(text, dialect)
-        length, rate = _preamble(path, dialect)
+    with path.open(newline="", encoding=dialect.encoding) as text:
+        names, units, skipped = _header(text, dialect)
+    length, rate = _preamble(path, dialect)
 
-        columns: dict[str, BinaryIO] = {}
-        count, notice = 0, ""
+    def write(files: Mapping[str, BinaryIO]) -> str:
+        places = {names.index(name): file for name, file in files.items()}
+        width = max(number for number, name in enumerate(names, 1) if name)
+        count, notice = spool(path, dialect, skipped, width, places)
+        if length > count:  # an oscilloscope may have written a part of its record
+            return f"the table has {count} rows, its preamble declares {length:g} samples"
+        return notice
 
-        def prepare(wanted: Iterable[str]) -> None:
-            nonlocal count, notice
-            for name in wanted:
-                columns[name] = files.enter_context(tempfile.TemporaryFile(dir=folder))
-            places = {names.index(name): columns[name] for name in columns}
-            width = max(number for number, name in enumerate(names, 1) if name)
-            count, notice = spool(path, dialect, skipped, width, places)
-            if length > count:  # an oscilloscope may have written a part of its record
-                notice = f"the table has {count} rows, its preamble declares {length:g} samples"
+    def about(name: str) -> dict[str, Any]:
+        return {"unit": units[names.index(name)], "sample_rate": rate}
 
-        def channel(name: str) -> Channel:
-            about = {"unit": units[names.index(name)], "sample_rate": rate, "notice": notice}
-            return spooled_channel(name, columns[name], count, **about)
-
-        yield Contents(names, channel, prepare)
+    with spooled(names, folder, write, about) as contents:
+        yield contents
 
 
 def _refuse_another(path: pathlib.Path) -> None:
@@ -269,7 +254,7 @@ def _guessed(lines: list[str], encoding: str) -> Dialect | None:
     for delimiter, decimal in signs:  # columns of numbers beside a preamble
         dialect = Dialect(delimiter, decimal, 0, encoding)
         rows = [dialect.cells(line) for line in lines[:3]]
-        columns = [all(map(dialect.is_number, column)) for column in zip(*rows, strict=False)]
+        columns = [None not in map(dialect.number, cells) for cells in zip(*rows, strict=False)]
         if len(rows) == 3 and sum(columns) > 1:
             return dialect
     return None
@@ -312,19 +297,21 @@ def _preamble(path: pathlib.Path, dialect: Dialect) -> tuple[float, float | None
     with path.open(newline="", encoding=dialect.encoding) as text:
         for line in itertools.islice(text, LINES):
             cells = dialect.cells(line)
-            for name, value in [
+            pairs = [
                 *zip(above, cells, strict=False),
                 *(cell.split("=") for cell in cells if cell.count("=") == 1),
-            ]:
-                if name.strip().lower() in ("increment", "tinc") and dialect.is_number(value):
-                    rate = rate_of(float(value.replace(dialect.decimal, ".")), 1e-6)
-            cell, value, unit, *_ = (*cells, "", "", "")
+            ]
             above = cells
-            if not dialect.is_number(value):
-                continue
-            number, name = float(value.replace(dialect.decimal, ".")), cell.strip(":").lower()
+            rigol = ("increment", "tinc")
+            intervals = [(value, "s") for name, value in pairs if name.strip().lower() in rigol]
+            name, value, unit, *_ = (*cells, "", "", "")
+            name = name.strip(":").lower()
             if name in ("record length", "memory length", "number of samples", "points"):
-                length = number
+                length = dialect.number(value) or length
             elif name in ("sample interval", "sampling period"):
-                rate = rate_of(number, 1e-6, unit if parse_unit(unit) else "s")
+                intervals.append((value, unit if parse_unit(unit) else "s"))
+            for value, unit in intervals:
+                interval = dialect.number(value)
+                if interval is not None:
+                    rate = rate_of(interval, 1e-6, unit)
     return length, rate

@@ -9,12 +9,12 @@ import contextlib
 import itertools
 import pathlib
 import tempfile
-from collections.abc import Iterable, Iterator
-from typing import BinaryIO
+from collections.abc import Iterator, Mapping
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, rate_of, spooled_channel
+from etid.files.channel import Contents, rate_of, spooled
 from etid.files.clock import QUARTZ
 from etid.files.readers.delimited import LINES, Dialect, spool
 from etid.recordings.recording import RecordingError
@@ -22,7 +22,7 @@ from etid.recordings.recording import RecordingError
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
-    """Channels of an lvm file; `prepare` copies the needed ones to temporary binary files."""
+    """Channels of an lvm file."""
     with path.open(encoding="utf-8-sig", errors="replace") as text:
         lines = [line.rstrip("\r\n") for line in itertools.islice(text, LINES)]
     if not lines or not lines[0].startswith("LabVIEW Measurement"):
@@ -62,31 +62,23 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     rate = rate_of(interval, 1e-6, _first(own, "X_Unit_Label", "s"))
     units = dict(zip(channels, own.get("Y_Unit_Label", []), strict=False))
     lengths = dict(zip(channels, own.get("Samples", []), strict=False))
-    files: dict[str, BinaryIO] = {}
-    count, notice = 0, ""
-    with contextlib.ExitStack() as stack:
 
-        def prepare(wanted: Iterable[str]) -> None:
-            nonlocal count, notice
-            for name in {*wanted, names[0]} if timed else wanted:
-                files[name] = stack.enter_context(tempfile.TemporaryFile(dir=folder))
-            columns = {names.index(name): files[name] for name in files}
-            count, notice = spool(path, dialect, ends[1] + 2, len(names) + 1, columns)
+    def write(files: Mapping[str, BinaryIO]) -> str:
+        columns = {names.index(name): file for name, file in files.items()}
+        with tempfile.TemporaryFile(dir=folder) as times:
             if timed and rate:
-                _check_times(channel(names[0]).read(0, 0, count), rate)
+                columns[0] = times
+            _, notice = spool(path, dialect, ends[1] + 2, len(names) + 1, columns)
+            if timed and rate:
+                _check_times(np.memmap(times, np.float64, "r"), rate)
+        return notice
 
-        def channel(name: str) -> Channel:
-            return spooled_channel(
-                name,
-                files[name],
-                count,
-                unit=units.get(name, "").strip(),
-                sample_rate=rate,
-                declared=int(lengths.get(name, "").strip() or 0),
-                notice=notice,
-            )
+    def about(name: str) -> dict[str, Any]:
+        declared = int(lengths.get(name, "").strip() or 0)
+        return {"unit": units.get(name, "").strip(), "sample_rate": rate, "declared": declared}
 
-        yield Contents(tuple(channels), channel, prepare)
+    with spooled(channels, folder, write, about) as contents:
+        yield contents
 
 
 def _check_times(times: np.ndarray, rate: float) -> None:

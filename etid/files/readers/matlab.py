@@ -15,11 +15,12 @@ from typing import Any
 
 import h5py
 import numpy as np
+import scipy.io
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
-from etid.files.channel import Channel, Contents, array_channel, real
+from etid.files.channel import Channel, Contents, array_channel
 from etid.recordings import limits
-from etid.recordings.errors import RecordingError, optional
+from etid.recordings.errors import RecordingError
 from etid.recordings.untrusted import attribute, check_size, guarded, local_link
 
 
@@ -68,9 +69,8 @@ def _hdf5(file: h5py.File) -> Contents:
             raise RecordingError(f"{name!r} is a {kind} array, must be an array of real numbers")
         if "MATLAB_empty" in data.attrs or data.shape is None:
             raise RecordingError(f"{name!r} is empty")
-        real(name, data.dtype, data.shape)
         check_size(data)
-        axes = [axis for axis, size in enumerate(data.shape) if size > 1] or [0]
+        axes = [axis for axis, size in enumerate(data.shape) if size != 1] or [0]
         shape = tuple(data.shape[axis] for axis in reversed(axes))
 
         def read(trial: int, start: int, stop: int) -> np.ndarray:
@@ -87,16 +87,13 @@ def _hdf5(file: h5py.File) -> Contents:
 
 def _whole(path: pathlib.Path) -> Contents:
     """Channels of version 5 and older."""
-    pymatreader = optional("pymatreader", "matlab", str(path))
-    from scipy.io.matlab import MatReadError
-
     check(path)
     try:
         # Variables that SciPy leaves out are named where they are asked for.
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            content = _flat(pymatreader.read_mat(path))
-    except (MatReadError, UnboundLocalError) as error:  # SciPy knows not all classes of arrays
+            content = _flat(scipy.io.loadmat(path, simplify_cells=True))
+    except (scipy.io.matlab.MatReadError, UnboundLocalError) as error:  # an unknown class of array
         raise RecordingError(f"cannot be read ({error})") from error
     if any("byte ordering" in str(one.message) for one in said):
         raise RecordingError(

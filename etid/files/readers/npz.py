@@ -1,7 +1,6 @@
 """Reader for NumPy archives: named arrays, or converter codes with all fields of the recordings."""
 
 import contextlib
-import dataclasses
 import math
 import pathlib
 import zipfile
@@ -36,10 +35,9 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
 
         def channel(name: str) -> Channel:
             _check_size(archive, name)
-            own = array_channel(name, np.atleast_1d(archive[name]))
-            if name in CODES and _is_complete(archive):
-                return dataclasses.replace(own, conversion=_volts(archive), unit="V")
-            return own
+            codes = name in CODES and _is_complete(archive)
+            own = {"conversion": _volts(archive), "unit": "V"} if codes else {}
+            return array_channel(name, np.atleast_1d(archive[name]), **own)
 
         yield Contents(tuple(archive.files), channel)
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, one_unit, rate_of, real
+from etid.files.channel import Channel, Contents, one_unit, rate_of
 from etid.recordings.errors import RecordingError, optional
 
 
@@ -96,7 +96,6 @@ def _channel(name: str, channel: Any) -> Channel:
             f"{name!r} has the scaling {', '.join(sorted(kinds))}, which gives neither volts nor "
             "amperes"
         )
-    real(name, channel.dtype, (len(channel),))
     raw = np.dtype(getattr(channel.data_type, "nptype", None) or "V8")
     slope, intercept = _line(own) if raw.kind in "iuf" else (1.0, 0.0)
     scaled = (slope, intercept) == (1.0, 0.0)

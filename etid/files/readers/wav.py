@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 import scipy.io.wavfile
 
-from etid.files.channel import Channel, Contents
+from etid.files.channel import Channel, Contents, array_channel
 from etid.recordings.recording import RecordingError
 
 
@@ -29,28 +29,18 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
             rate, samples = scipy.io.wavfile.read(path, mmap=True)
         except ValueError:
             rate, samples = scipy.io.wavfile.read(path)  # 24 bits
-    if samples.size == 0:
-        raise RecordingError("the file has no samples")
-    columns = samples.reshape(samples.shape[0], -1)
+    columns = np.atleast_2d(samples.T).T  # (time, channel)
     names = tuple(str(number + 1) for number in range(columns.shape[1]))
 
     def channel(name: str) -> Channel:
         column = columns[:, names.index(name)]
         whole = column.dtype.kind in "iu"
-        full = 2.0 ** (8 * column.dtype.itemsize - 1) if whole else 1.0
-        middle = -1.0 if column.dtype.kind == "u" else 0.0  # 8 bits have no sign
-
-        def read(_: int, start: int, stop: int) -> np.ndarray:
-            return np.array(column[start:stop])
-
-        return Channel(
+        return array_channel(
             name,
-            (column.size,),
-            column.dtype,
-            read,
+            column,
             sample_rate=float(rate),
-            conversion=1 / full,
-            offset=middle,
+            conversion=2.0 ** (1 - 8 * column.dtype.itemsize) if whole else 1.0,
+            offset=-1.0 if column.dtype.kind == "u" else 0.0,  # 8 bits have no sign
         )
 
     yield Contents(names, channel)
