@@ -98,13 +98,21 @@ def test_the_line_on_what_helps_is_that_of_the_least_known_element(today):
 def test_the_command_writes_a_driver_and_a_picture(scene, today, tmp_path, capsys, monkeypatch):
     study, driver, picture = (tmp_path / name for name in ("study.h5", "driver.h5", "z.svg"))
     scene.simulate(seed=0).write(study)
-    formers = []
-    monkeypatch.setattr(command, "calibrate", lambda _, former: formers.append(former) or today)
+    formers, orders = [], []
+
+    def fake(_, *, order, former):
+        orders.append(order)
+        formers.append(former)
+        return today
+
+    monkeypatch.setattr(command, "calibrate", fake)
     assert main(["calibrate", str(study), "-o", str(driver), "--picture", str(picture)]) == 0
     assert "standard errors to expect of skin" in capsys.readouterr().out
     assert picture.read_text("utf-8").lstrip().startswith("<?xml")
     again = tmp_path / "again.h5"
-    assert main(["calibrate", str(driver), "-o", str(again), "--former", str(driver)]) == 0
+    command_line = ["calibrate", str(driver), "-o", str(again), "--former", str(driver)]
+    assert main([*command_line, "--order", "4"]) == 0
+    assert orders == ["auto", 4]
     frequency = np.geomspace(100.0, 80e3, 20)
     assert formers[0] is None
     np.testing.assert_array_equal(formers[1].response(frequency), today.driver.response(frequency))

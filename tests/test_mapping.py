@@ -78,6 +78,17 @@ def test_what_the_file_does_not_say_is_said_by_mapping_or_command(run, rig):
     assert units == {"v_th": ("mV", "file"), "v_out": ("V", "command")}
 
 
+def test_one_error_proposes_options_for_all_that_is_missing(rig):
+    with pytest.raises(RecordingError, match="are not given, and are not guessed") as caught:
+        imported(rig)
+    assert caught.value.field == "v_th, v_out, pulse_rate, scale"
+    options = "--v-th rig/open --v-out rig/skin --pulse-rate 60 --scale 1; or name the measured"
+    assert options in caught.value.remedy
+    with pytest.raises(RecordingError, match=r"as in --v-th rig/open --scale 1; ") as caught:
+        imported(rig, v_out="rig/skin", pulse_rate=60.0)
+    assert caught.value.field == "v_th, scale"
+
+
 A, B = "[[recording]]\npath = 'a'\n", "[[recording]]\npath = 'b'\n"
 
 
@@ -87,7 +98,7 @@ A, B = "[[recording]]\npath = 'a'\n", "[[recording]]\npath = 'b'\n"
         ("rig/skin", "rig/Skin", r"v_out: there is no 'rig/Skin'; the names are 'rig/open', "),
         ('v_out = {channel = "rig/skin"}', "", r"v_out: is not given.* channels are 'rig/open', "),
         ("pulse_rate = 60.0", "", "pulse_rate: is not given, and is not guessed"),
-        ("scale = 0.0535", "", "scale: is not given.*those at the terminal"),
+        ("scale = 0.0535", "", "scale: is not given.*values at the terminal"),
         ("rig/skin", "rig/plain", "v_out.unit: is not given of channel 'rig/plain', the file"),
         ('"rig/skin"', '"rig/skin", unit = "V"', "v_out.unit: the mapping says 'V'.*says 'mV'"),
         ('"rig/skin"', '"rig/skin", unit = "furlong"', "unit: is 'furlong', which is not a unit"),

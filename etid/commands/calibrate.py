@@ -4,10 +4,11 @@ import argparse
 import pathlib
 
 from etid.commands import Outcome
+from etid.commands.fit import order
 from etid.plotting import figure_of
 from etid.plotting.style import save
 from etid.recordings.replacing import HDF5
-from etid.results.driver import Driver
+from etid.results.driver import AUTO, Driver
 from etid.simulation.calibration import calibrate, calibrations_in, read_driver
 
 
@@ -17,6 +18,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "source", type=pathlib.Path, nargs="+", metavar="FILE", help="files with calibrations"
     )
     parser.add_argument("-o", dest="target", type=pathlib.Path, required=True, metavar="DRIVER")
+    parser.add_argument(
+        "--order",
+        type=order,
+        default=AUTO,
+        metavar="NUMBER",
+        help="number of poles of the driver; default auto: the least that the calibrations support",
+    )
     parser.add_argument(
         "--former",
         type=pathlib.Path,
@@ -42,8 +50,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     records = calibrations_in(arguments.source)
     drivers: dict[str, Driver] = {}
     if arguments.former is not None:
-        drivers[arguments.former.stem] = read_driver(arguments.former)
-    found = calibrate(records, former=next(iter(drivers.values()), None))
+        drivers[arguments.former.stem] = read_driver(arguments.former, order=arguments.order)
+    found = calibrate(records, order=arguments.order, former=next(iter(drivers.values()), None))
     found.driver.write(arguments.target)
     if arguments.picture is not None:
         save(figure_of({arguments.target.stem: found.driver} | drivers), arguments.picture)

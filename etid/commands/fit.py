@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--order",
-        type=_order,
+        type=order,
         metavar="N",
         help="number of poles of the driver, or auto: the least that the calibrations support; "
         "default 5, with --driver auto",
@@ -103,7 +103,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _order(text: str) -> Order:
+def order(text: str) -> Order:
     """The value of --order."""
     try:
         return order_of(int(text) if text.lstrip("-").isdecimal() else text)

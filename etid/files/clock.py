@@ -47,7 +47,7 @@ def sample_rate(
                 "is not given, the file does not contain it, and it is not guessed: one of time "
                 "and sample_rate is needed",
                 field="sample_rate",
-                remedy="Give the rate, or the channel of the time",
+                remedy="Give the rate, with --sample-rate, or the channel of the time, with --time",
             )
         return theirs, "file"
     if theirs is None:

@@ -18,6 +18,7 @@ from typing import Any
 
 import tomli_w
 
+from etid.circuits.display import several
 from etid.files.assemble import Imported
 from etid.files.channel import located
 from etid.files.importing import channels_of, converted
@@ -59,7 +60,10 @@ class ImportedFolder:
         # All files have the same options, so the channels of the first are those of all.
         _, *channels = str(next(iter(self.imported.values()))).splitlines()
         known = sum("r_load" in of for of in self.labels.values())
-        lines += [*channels, f"{len(self.labels)} files, {known} of them with a known resistor"]
+        files = several(len(self.labels), "file")
+        lines += [*channels, f"{files}, {known} of them with a known resistor"]
+        if known == len(self.labels):
+            lines.append("no file of skin: none without a resistor matches a pattern")
         if self.unmatched:
             lines.append(f"left out, matches no pattern: {', '.join(self.unmatched)}")
         return "\n".join([*lines, f"mapping: {self.mapping}"])

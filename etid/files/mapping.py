@@ -211,19 +211,12 @@ def _of_channels(said: Mapping[str, Any], names: Sequence[str]) -> list[Mapping[
 
 
 def _plan(path: str, said: Mapping[str, Any], names: Sequence[str]) -> Plan:
-    by_current = "current" in said and "r_load" not in said  # a load that needs no v_th
-    for name in ("v_th", "v_out", "pulse_rate"):
-        if name not in said and not (name == "v_th" and by_current):
-            known = f"; the channels are {listed(names)}" if name != "pulse_rate" else ""
-            hint = "; or name the measured current, with --current" if name == "v_th" else ""
-            raise _missing(name, known, hint)
+    _check_complete(said, names)
     signals = {
         name: _signal(name, said[name], said.get("scale")) for name in CHANNELS if name in said
     }
     for name, signal in signals.items():
         chosen(names, signal.channel, name)
-        if signal.scale is None and name in ("v_th", "v_out"):
-            raise _missing("scale", hint="; 1 if the values are those at the terminal")
     th, out = signals.get("v_th"), signals["v_out"]
     if th is not None and (th.channel, th.rows) == (out.channel, out.rows):
         raise RecordingError(
@@ -268,12 +261,34 @@ def _electrodes(said: Any, split: str) -> tuple[str, ...]:
     return tuple(DECLARED["electrode"].checked(one) for one in (said if several else [said]))
 
 
-def _missing(name: str, known: str = "", hint: str = "") -> RecordingError:
-    option = name.replace("_", "-")
-    return RecordingError(
-        f"is not given, and is not guessed{known}",
-        field=name,
-        remedy=f"Give it in the mapping, or with --{option}{hint}",
+def _check_complete(said: Mapping[str, Any], names: Sequence[str]) -> None:
+    """Raise one error for all that is missing, with the options that would give it."""
+    by_current = "current" in said and "r_load" not in said  # a load that needs no v_th
+    voltages = ("v_out",) if by_current else ("v_th", "v_out")
+    own = [of for name in voltages if isinstance(of := said.get(name, {}), Mapping)]
+    missing = [name for name in (*voltages, "pulse_rate") if name not in said]
+    if "scale" not in said and any("scale" not in of for of in own):
+        missing.append("scale")
+    if not missing:
+        return
+    free = [name for name in names if name not in [of.get("channel") for of in own]]
+    example = {"pulse_rate": "60", "scale": "1"} | dict(zip(voltages, free, strict=False))
+    options = [f"--{name.replace('_', '-')} {example.get(name, 'CHANNEL')}" for name in missing]
+    hints = {
+        "v_th": "or name the measured current, with --current",
+        "scale": "a scale of 1 is that of values at the terminal",
+    }
+    one = len(missing) == 1
+    raise RecordingError(
+        f"{'is' if one else 'are'} not given, and {'is' if one else 'are'} not guessed; "
+        f"the channels are {listed(names)}",
+        field=", ".join(missing),
+        remedy="; ".join(
+            [
+                f"Give {'it' if one else 'them'} in the mapping, or as in {' '.join(options)}",
+                *(hint for name, hint in hints.items() if name in missing),
+            ]
+        ),
     )
 
 
