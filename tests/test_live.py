@@ -59,8 +59,8 @@ class Stimulator:
         given: Amplitudes of all pulses.
     """
 
-    def __init__(self, electrodes, pause=0.0):
-        self.skin, self.given, self.pause = ["dry"] * electrodes, [], pause
+    def __init__(self, electrodes):
+        self.skin, self.given = ["dry"] * electrodes, []
         self.server = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.server.getsockname()[1]}"
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -80,7 +80,7 @@ class Stimulator:
                     begin = round((len(self.given) - 1) * PERIOD)
                     line.sendall(np.array([begin, *v.shape], "<i8").tobytes() + v.tobytes())
                     before = now
-                    time.sleep(self.pause)
+                    time.sleep(0.01)
 
 
 def controller_of(electrodes, **limits):
@@ -344,7 +344,7 @@ def fill(name):
 
 
 def test_a_browser_shows_the_skin_and_stops_it():
-    controller, stimulator = controller_of(TEN), Stimulator(TEN, pause=0.01)
+    controller, stimulator = controller_of(TEN), Stimulator(TEN)
     with chromium() as browser:
         with LiveView(controller, charge=WANTED, controls=True, port=0) as view:
             with running(view, stimulator, controller) as (thread, ticks):

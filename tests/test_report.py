@@ -1,55 +1,15 @@
-"""Tables and pages, and the arithmetic of the demo's tables."""
+"""The arithmetic of the demo's tables."""
 
 import dataclasses
-import html.parser
-import re
 
 import numpy as np
 import pytest
 
 import etid
 from etid.paper import demo, tables
-from etid.report import html as report
 from tests import pictures
 
 EXCESS = 1.1  # of every identified element over the true one
-
-
-class _Balance(html.parser.HTMLParser):
-    """Fails on an element that is not closed where it was opened."""
-
-    def __init__(self):
-        super().__init__()
-        self.open = []
-
-    def handle_starttag(self, tag, attrs):
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-
-def test_page_is_whole_escaped_and_needs_no_other_file(tmp_path):
-    picture = report.Picture("caption <c>", b"<svg xmlns='http://www.w3.org/2000/svg'/>", 'a "b"')
-    table = report.Table(("x", "y"), (("<1>", "2"),), (("", 1), ("<g>", 1)), "of <t>")
-    section = report.Section(
-        "R < 1", "a & `b < c`", (table,), (picture,), "<w>", "in full", "@x{<key>}"
-    )
-    report.write_page(tmp_path / "page.html", "Title <t>", "text", [section])
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    parser = _Balance()
-    parser.feed(page)
-    assert parser.open == []
-    for escaped in (
-        "Title &lt;t&gt;", "R &lt; 1", "a &amp; <code>b &lt; c</code>",
-        "&lt;1&gt;", "&lt;g&gt;", "of &lt;t&gt;",
-        "caption &lt;c&gt;", "a &#34;b&#34;", "&lt;w&gt;", "@x{&lt;key&gt;}",
-    ):  # fmt: skip
-        assert escaped in page
-    assert all(source.startswith("data:") for source in re.findall(r'src="([^"]*)"', page))
-    assert re.findall(r'href="([^"]*)"', page) == ["#r-1"]
-    assert 'id="r-1"' in page
 
 
 @pytest.fixture

@@ -87,16 +87,22 @@ def page(found, study_file):
 
 
 class _Read(html.parser.HTMLParser):
-    """Elements, attributes and text of a page."""
+    """Elements, attributes and text of a page; each element is closed where it was opened."""
 
     def __init__(self, page):
         super().__init__()
-        self.elements, self.attributes, self.text = [], [], ""
+        self.elements, self.attributes, self.text, self.open = [], [], "", []
         self.feed(page.read_text(encoding="utf-8"))
+        assert self.open == []
 
     def handle_starttag(self, tag, attrs):
         self.elements.append(tag)
         self.attributes += attrs
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
 
     def handle_data(self, data):
         self.text += data
@@ -282,9 +288,12 @@ def test_a_file_with_an_element_of_zero_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("shown", "text"),
     [
-        *((tables.significant(0.01234), "0.012"), (tables.significant(123.4), "120")),
-        *((tables.significant(5.0), "5"), (tables.significant(3e7), "3.0e+07")),
-        *((tables.significant(np.nan), ""), (tables.significant(np.inf), "")),
+        (tables.significant(0.01234), "0.012"),
+        (tables.significant(123.4), "120"),
+        (tables.significant(5.0), "5"),
+        (tables.significant(3e7), "3.0e+07"),
+        (tables.significant(np.nan), ""),
+        (tables.significant(np.inf), ""),
         (tables.element(186e3, 1e3, 1e3), "186.0 ± 1.0"),
         (tables.element(186e3, 400e3, 1e3), "not determined (± 400)"),
         (tables.element(186e3, np.inf, 1e3), "not determined"),

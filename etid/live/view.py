@@ -5,7 +5,6 @@ of fixed size. A newer snapshot replaces an older one, and nothing here waits fo
 process ends, nobody could stop any more: this counts as a stop.
 """
 
-import contextlib
 import importlib.util
 import multiprocessing
 import secrets
@@ -42,7 +41,7 @@ HIGH = 0.2  # of the largest voltage, which is exceeded where the pulse is drawn
 NANO = 1e-9
 
 
-class LiveView(contextlib.AbstractContextManager):
+class LiveView:
     """A page that shows a display.
 
     Attributes:
@@ -90,7 +89,7 @@ class LiveView(contextlib.AbstractContextManager):
         high = np.flatnonzero(np.abs(of := bands.waveform()) > HIGH * np.abs(of).max())
         margin = (high[-1] - high[0]) // 2 + 1
         self._part = slice(max(high[0] - margin, 0), high[-1] + margin)
-        units = circuit.units()
+        units = {name: circuit.units()[name] for name in circuit.names()}
         self._scale = np.array([DISPLAY[unit][0] for unit in units.values()])
         samples = np.arange(of.size)[self._part]
         dtype = [
@@ -130,10 +129,7 @@ class LiveView(contextlib.AbstractContextManager):
         self._spare = tracker.period / bands.sample_rate / 2
         self._words = [UNKNOWN] * number
         self._alarms: deque[str] = deque(maxlen=ALARMS)
-        # This compiles what `show` uses, before a pulse waits.
-        state = tracker.start()
-        _undelayed(tracker.model, np.asarray(state.electrodes.own)[0])
-        tracker.bad_electrodes(state)
+        self._compile()
 
     @property
     def stopped(self) -> bool:
@@ -185,8 +181,17 @@ class LiveView(contextlib.AbstractContextManager):
         self._process.terminate()
         self._process.join()
 
+    def __enter__(self) -> "LiveView":
+        return self
+
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _compile(self) -> None:
+        """Compile what `show` uses, before a pulse waits."""
+        state = self._controller.tracker.start()
+        self._gain(np.asarray(state.electrodes.own)[0])
+        self._controller.tracker.bad_electrodes(state)
 
     def _seen(self, tick: "Tick") -> list[str]:
         """The state of each electrode in words."""
@@ -223,9 +228,9 @@ class LiveView(contextlib.AbstractContextManager):
         before, state = tick.before.electrodes, tick.state.electrodes
         if not np.asarray(before.pulses)[at]:
             return np.full(self._snapshot["predicted"].shape[-1], np.nan)
-        model = self._controller.tracker.model
-        bands, own = model.bands, np.asarray(state.own)[at]
-        x, gain = np.asarray(bands.x), np.asarray(_undelayed(model, np.asarray(before.own)[at]))
+        bands = self._controller.tracker.model.bands
+        x, own = np.asarray(bands.x), np.asarray(state.own)[at]
+        gain = self._gain(np.asarray(before.own)[at])
         turn = np.arange(1, x.size + 1) / bands.samples  # per sample
         centres = np.asarray(bands.frequency) / bands.sample_rate
         by_bin = np.interp(turn, centres, gain)
@@ -234,11 +239,13 @@ class LiveView(contextlib.AbstractContextManager):
         pulse = np.fft.irfft(np.asarray(state.amplitude)[at] * spectrum, bands.samples)
         return pulse[self._part] + tick.window[at].mean()
 
+    @in_float64
+    def _gain(self, own: Float[np.ndarray, " own"]) -> Complex[np.ndarray, " band"]:
+        return np.asarray(_undelayed(self._controller.tracker.model, own))
 
-@in_float64
+
 @jax.jit
 def _undelayed(model: GainModel, own: Float[Array, " own"]) -> Complex[Array, " band"]:
-    """Gain in each band with the elements of a lane."""
     return model.undelayed(LoadUnknowns.of(own).log_elements)
 
 

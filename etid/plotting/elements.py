@@ -19,6 +19,7 @@ from etid.plotting.style import (
     drawable,
     key,
     nth,
+    plain,
     plain_ticks,
     symbol,
     titled,
@@ -93,11 +94,11 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
         if len(fits) <= 40:  # there is room for the names of the trials
             for row in np.flatnonzero(shown):
                 axis.annotate(
-                    str(fits.labels["trial"][row]), (x[row], values[row]), xytext=(4, 3),
+                    plain(str(fits.labels["trial"][row])), (x[row], values[row]), xytext=(4, 3),
                     textcoords="offset points", fontsize=7, color="0.35",
                 )  # fmt: skip
         axis.set_ylabel(symbol(name, unit))
-    names = [one or "-" for one in groups.tolist()]
+    names = [plain(one) or "-" for one in groups.tolist()]
     turned = sum(map(len, names)) > 60
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
     axes[-1].set_xlabel(by[0])
@@ -145,7 +146,7 @@ def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
         )
     plain_ticks(axis.xaxis)
     axis.set_xlabel("smallest relative standard error [%]")
-    axis.set_yticks(range(len(bounds)), [one.path or "-" for one in bounds])
+    axis.set_yticks(range(len(bounds)), [plain(one.path) or "-" for one in bounds])
     axis.set_ylim(len(bounds) - 0.5, -0.5)
     beside = {"loc": "upper left", "bbox_to_anchor": (1, 1)}
     _legend(axis, names, "undetermined" if undetermined else "", **beside)

@@ -8,7 +8,18 @@ from matplotlib.colors import LogNorm
 
 from etid.circuits.display import DISPLAY
 from etid.plotting.layout import Layout
-from etid.plotting.style import INK, MARKS, Canvas, drawable, key, nth, plain_ticks, symbol, titled
+from etid.plotting.style import (
+    INK,
+    MARKS,
+    Canvas,
+    drawable,
+    key,
+    nth,
+    plain,
+    plain_ticks,
+    symbol,
+    titled,
+)
 from etid.results.fits import Fits
 
 COLOURS = "cividis"  # readers with and without red-green blindness see it alike
@@ -54,7 +65,7 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
             at, mark = (1e3 * layout.x[one], 1e3 * layout.y[one]), marks.get(verdict, "x")
             axis.plot(*at, mark, ms=6, color=INK, mfc="white")
         count = f"{shown.size} of {shown.size + failed.size} electrodes"
-        titled(axis, [", ".join(filter(None, group)), count])
+        titled(axis, [plain(", ".join(filter(None, group))), count])
     for axis in axes.flat[len(groups) :]:
         axis.set_axis_off()
     for axis in axes[-1]:

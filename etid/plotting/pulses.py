@@ -7,7 +7,7 @@ from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.circuits.display import heading, scaled
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
-from etid.plotting.style import BLUE, INK, RED, Canvas, judged, titled, typeset
+from etid.plotting.style import BLUE, INK, RED, Canvas, judged, plain, titled, typeset
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
@@ -57,7 +57,7 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
     labels = [f"{name} {value}" for name in LABELS if (value := getattr(recording, name))]
     if recording.r_load is not None:
         labels.append(f"calibration with {recording.r_load / 1e3:g} kΩ")
-    titled(axes[0, 0], [recording.path, ", ".join(labels)])
+    titled(axes[0, 0], [plain(recording.path), plain(", ".join(labels))])
     titled(axes[0, 1], ["one pulse"])
     axes[0, 1].legend(fontsize="medium")
     return axes.ravel()

@@ -94,7 +94,7 @@ def nth(looks: Sequence[Any], number: int) -> Any:
 def key(label: str, mark: str, colour: str = INK, *, hollow: bool = False) -> Line2D:
     """An entry of a legend: a mark with its meaning."""
     face = "white" if hollow else colour
-    return Line2D([], [], ls="", marker=mark, ms=4, color=colour, mfc=face, label=label)
+    return Line2D([], [], ls="", marker=mark, ms=4, color=colour, mfc=face, label=plain(label))
 
 
 def drawable(values: np.ndarray) -> np.ndarray:
@@ -131,6 +131,11 @@ def symbol(name: str, unit: str) -> str:
     return heading(f"${letter}{subscript}$", unit)
 
 
+def plain(text: str) -> str:
+    """A name from a file, in which matplotlib must see no formula: dollar signs are escaped."""
+    return text.replace("$", r"\$")
+
+
 def typeset(text: str) -> str:
     """A text with its symbols as formulas: `r_s 33.4 kΩ` begins with an R with the subscript s."""
     return _SYMBOL.sub(lambda found: symbol(found[0], "1"), text)
@@ -150,7 +155,7 @@ def judged(axis: Axes, path: str, found: Fit | Driver, *more: str) -> None:
         words.append(f"chi2 {chi2:.3g}")
     if np.isfinite(rrse := float(found.rrse)):
         words.append(f"RRSE {100 * rrse:.3g} %")
-    headline = ": ".join(filter(None, [path, ", ".join(words)]))
+    headline = ": ".join(filter(None, [plain(path), ", ".join(words)]))
     titled(axis, [headline, *more], good=good)
 
 

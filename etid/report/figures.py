@@ -25,6 +25,7 @@ from etid.plotting.style import (
     PAPER,
     drawable,
     new_figure,
+    plain,
     plain_ticks,
     svg,
     symbol,
@@ -53,7 +54,7 @@ def distributions(fits: Fits) -> bytes:
                 axis.step(
                     np.quantile(values, p, method="inverted_cdf"), 100 * p, ls=DASHES[series],
                     where="post", color=COLOURS[series], lw=1.3,
-                    label=f"{_short(condition) or 'all'} ({values.size})",
+                    label=f"{plain(_short(condition)) or 'all'} ({values.size})",
                 )  # fmt: skip
         axis.set(xlabel=symbol(name, unit))
         axis.xaxis.set_major_locator(MaxNLocator(5))
@@ -122,13 +123,13 @@ def by_subject(fits: Fits) -> bytes:
             axis.vlines(where, quantiles[1], quantiles[3], color=colour, lw=2.6 * thin)
             axis.plot(
                 where, quantiles[2], MARKS[series], color=colour, ms=4.5 * thin,
-                markerfacecolor="white", label=_short(condition) or "all",
+                markerfacecolor="white", label=plain(_short(condition)) or "all",
             )  # fmt: skip
         axis.set(yscale="log", ylabel=symbol(name, unit))
         plain_ticks(axis.yaxis)
     last = axes[-1, 0]
     if named:
-        names = [_short(subject) or "-" for subject in subjects]
+        names = [plain(_short(subject)) or "-" for subject in subjects]
         turned = sum(map(len, names)) > 10 * width
         last.set_xticks(range(subjects.size), names, rotation=90 if turned else 0)
     elif subjects.size > CROWD:
@@ -145,13 +146,8 @@ def _thinned(quantiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linspace(0.0, CROWD - 1.0, chosen.size), quantiles[:, chosen]
 
 
-def plain(name: str) -> str:
-    """A name for a figure; dollar signs are escaped, because matplotlib reads them as formulas."""
-    return name.replace("$", r"\$")
-
-
 def _short(name: str, length: int = 16) -> str:
-    return plain(name if len(name) <= length else name[: length - 1] + "…")
+    return name if len(name) <= length else name[: length - 1] + "…"
 
 
 def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -181,7 +177,7 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
         place = np.arange(len(parts)) + 0.15 * (series - (len(conditions) - 1) / 2)
         axes[0, names.index(one.name)].plot(
             sizes[shown], place[shown], MARKS[series], color=COLOURS[series], ms=6,
-            label=_short(one.condition) or "all",
+            label=plain(_short(one.condition)) or "all",
         )  # fmt: skip
     for axis, name in zip(axes[0], names, strict=True):
         axis.set(xscale="log", xlabel=f"{symbol(name, '1')}: part of the median [%]")
@@ -220,4 +216,4 @@ def _shortened(fits: Fits, names: Sequence[str]) -> Fits:
 
 def drivers(found: Mapping[str, Driver]) -> bytes:
     """Z_th of drivers, with bands of two standard errors."""
-    return svg(figure_of({_short(name, 60): driver for name, driver in found.items()}))
+    return svg(figure_of({plain(_short(name, 60)): driver for name, driver in found.items()}))

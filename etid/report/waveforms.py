@@ -9,11 +9,9 @@ from matplotlib.figure import Figure
 
 from etid.plotting import figure_of
 from etid.plotting.style import svg
-from etid.recordings.fields import LABELS
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
-from etid.report.figures import plain
 from etid.report.html import Picture, Section
 from etid.report.tables import significant
 from etid.results.driver import Driver
@@ -74,12 +72,12 @@ def picture(found: StudyFits, study: Study, row: int, reason: str) -> Picture | 
         recording = study[path]
     except (RecordingError, KeyError):
         return None
-    labels = {name: plain(getattr(recording, name)) for name in ("path", *LABELS)}
     names = recording.calibration or tuple(study.calibrations)
     if found.settings is not None and found.settings.driver:
         names = next(iter(found.drivers), ())  # the only driver, of another file
-    driver = None if recording.cause == "current" else found.drivers.get(names)
-    figure, why = _predicted(recording.replace(**labels), fit, driver)
+    by_current = recording.cause == "current"  # the fit needs no driver then
+    driver = None if by_current else found.drivers.get(names)
+    figure, why = _predicted(recording, fit, driver)
     elements = ", ".join(fit.elements)
     about = f"{path}: {fit.verdict}{f' ({reason})' if reason else ''}."
     alt = f"One pulse of {path}: measured, predicted and residual voltage. {elements}"
@@ -117,20 +115,17 @@ def waveforms(found: StudyFits, study: Study | None, problem: str) -> Section:
         " If the model is right, the residual is noise. At the edges of a pulse it also contains "
         "frequencies near half the sample rate, which are aliased and not fitted."
     )
-    drawn = {
-        row: None if study is None else picture(found, study, row, reason)
-        for row, reason in chosen.items()
-    }
-    paths = {row: str(found.fits.labels["path"][row]) for row in chosen}
-    missing = [
-        f"{paths[row]} ({reason})" if reason else paths[row]
-        for row, reason in chosen.items()
-        if drawn[row] is None
-    ]
+    pictures, missing = [], []
+    for row, reason in chosen.items():
+        path = str(found.fits.labels["path"][row])
+        drawn = None if study is None else picture(found, study, row, reason)
+        if drawn is None:
+            missing.append(f"{path} ({reason})" if reason else path)
+        else:
+            pictures.append(drawn)
     if missing:
         text += f"\n\nThese recordings cannot be read and have no waveform: {', '.join(missing)}."
-    pictures = tuple(filter(None, drawn.values()))
-    return Section(heading, text, (), pictures, warning=problem)
+    return Section(heading, text, (), tuple(pictures), warning=problem)
 
 
 def relative_stderr(fits: Fits) -> np.ndarray:
