@@ -1,6 +1,5 @@
 """Headless Chromium by its DevTools protocol, over a pipe: what a page says of itself."""
 
-import base64
 import contextlib
 import json
 import os
@@ -59,20 +58,6 @@ class Page:
         result = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")  # undefined has none
-
-    def show(self, *, dark: bool = False, printed: bool = False) -> None:
-        """How the page is looked at from here on."""
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.call("Emulation.setEmulatedMedia", media="print" if printed else "", features=[scheme])
-
-    def screenshot(self) -> bytes:
-        """What is seen, as PNG."""
-        return base64.b64decode(self.call("Page.captureScreenshot")["data"])
-
-    def pdf(self) -> bytes:
-        """What is printed."""
-        printed = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)
-        return base64.b64decode(printed["data"])
 
     def close(self) -> None:
         """Close the pipe that Chromium wrote to."""

@@ -12,7 +12,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 
 import etid
 from etid.plotting import figure_of
@@ -49,24 +51,16 @@ def study() -> etid.Study:
 
 def driver(verdict: str = "successful") -> Driver:
     """About what that calibration gives."""
-    source = SourceImpedance(
-        jnp.array(6.0525),
-        jnp.array([12.6542, 12.87402]),
-        jnp.array([0.04925, -1.4639]),
-        jnp.array([2380.0, 9885.0]),
-        jnp.array([2956.0, 14014.0]),
-        jnp.array([5.531]),
-        jnp.array([-6754.0]),
-    )
+    of_poles = [12.6542, 12.87402], [0.04925, -1.4639], [2380.0, 9885.0], [2956.0, 14014.0]
+    source = SourceImpedance(*map(jnp.array, (6.0525, *of_poles, [5.531], [-6754.0])))
     errors = np.array([0.3, 0.05, 0.02, 0.1, 0.02, 100, 50, 200, 50, 0.02, 50])
-    r_load = jnp.array([98.8e3])
     return ContinuousDriver(
         b=jnp.ones(6),
         a=jnp.ones(6),
         sample_rate=200e3,
         source=source,
         cov=jnp.diag(jnp.asarray(errors**2)),
-        calibration=Calibration(r_load, jnp.zeros(1), jnp.array(0.5)),
+        calibration=Calibration(jnp.array([98.8e3]), jnp.zeros(1), jnp.array(0.5)),
         rrse=jnp.array(1e-3),
         chi2=jnp.array(1.02),
         result=verdicts_of(np.array(verdict)),
@@ -80,19 +74,37 @@ def as_kind(driver: Driver, kind: type[Driver]) -> Driver:
     return kind(**{field.name: getattr(driver, field.name) for field in dataclasses.fields(kind)})
 
 
-def fit(verdict: str = "successful", circuit: etid.AbstractCircuit = SKIN) -> Fit:
-    """A fit of one dry trial."""
-    cov = jnp.diag((circuit.values() * RELATIVE) ** 2)
+def fit(
+    verdict: str | np.ndarray = "successful",
+    circuit: etid.AbstractCircuit = SKIN,
+    own: float | np.ndarray = RELATIVE,
+    shared: float = 0.0,
+) -> Fit:
+    """A fit of one trial, or of many, with these relative standard errors of the elements."""
+    values = np.asarray(circuit.values())
+    shape = values.shape[:-1]
+    each = np.eye(values.shape[-1])
+    of_noise, of_driver = (
+        np.einsum("...i,ij->...ij", (error * values) ** 2, each) for error in (own, shared)
+    )
     return Fit(
         circuit=circuit,
-        cov=cov,
-        shared_cov=0 * cov,
-        rrse=jnp.array(1e-3),
-        chi2=jnp.array(1.02),
-        result=verdicts_of(np.array(verdict)),
-        steps=jnp.array(5),
+        cov=of_noise + of_driver,
+        shared_cov=of_driver,
+        rrse=np.full(shape, 1e-3),
+        chi2=np.full(shape, 1.02),
+        result=verdicts_of(np.asarray(verdict)),
+        steps=np.full(shape, 5),
         method="maximum_likelihood",
+        remarks=np.zeros(shape, int),
     )
+
+
+def fits_of(found: Fit, **labels: np.ndarray) -> Fits:
+    """Fits with these labels; other labels are empty."""
+    empty = np.full(np.shape(found.rrse), "")
+    names = ("path", "subject", "condition", "electrode", "trial")
+    return Fits(found, dict.fromkeys(names, empty) | labels, empty)
 
 
 @functools.cache
@@ -109,18 +121,8 @@ def selection(**verdicts: str) -> etid.Selection:
         verdict = verdicts.get(type(circuit).__name__, "successful")
         unseen = np.zeros(CHANGES), np.array(0.0), np.zeros(len(circuit.names()))
         support = Support(np.array(deviance), np.array(2e3), *unseen)
-        cov = jnp.diag((circuit.values() * 0.01) ** 2)
-        found[number] = Fit(
-            circuit=circuit,
-            cov=cov,
-            shared_cov=0 * cov,
-            rrse=jnp.array(1e-3),
-            chi2=jnp.array(deviance / 2e3),
-            result=verdicts_of(np.array(verdict)),
-            steps=jnp.array(5),
-            method="maximum_likelihood",
-            support=support,
-        )
+        one = fit(verdict, circuit, 0.01)
+        found[number] = dataclasses.replace(one, chi2=np.array(deviance / 2e3), support=support)
     return etid.Selection.of(found, 3, usual_circuits())
 
 
@@ -134,26 +136,13 @@ def fits() -> Fits:
     values[:, 4] *= 1e3
     verdicts = np.full(count, "successful", dtype=object)
     verdicts[[1, 4]] = "misfit", "insensitive"
-    cov = np.stack([np.diag((RELATIVE * one) ** 2) for one in values.T])
-    found = Fit(
-        circuit=etid.SkinRC(*jnp.asarray(values)),
-        cov=cov,
-        shared_cov=0 * cov,
-        rrse=np.full(count, 1e-3),
-        chi2=np.ones(count),
-        result=verdicts_of(verdicts),
-        steps=np.full(count, 5),
-        method="maximum_likelihood",
-        remarks=np.zeros(count, int),
+    return fits_of(
+        fit(verdicts, etid.SkinRC(*jnp.asarray(values))),
+        path=np.array([f"recording/{i:02d}" for i in range(count)]),
+        subject=np.repeat(["s01", "s02"], 6),
+        condition=np.where(dry, "dry", "damp"),
+        trial=np.array([str(i % 3) for i in range(count)]),
     )
-    labels = {
-        "path": np.array([f"recording/{i:02d}" for i in range(count)]),
-        "subject": np.repeat(["s01", "s02"], 6),
-        "condition": np.where(dry, "dry", "damp"),
-        "electrode": np.full(count, ""),
-        "trial": np.array([str(i % 3) for i in range(count)]),
-    }
-    return Fits(found, labels, np.full(count, ""))
 
 
 def bounds() -> dict[str, etid.Bound]:
@@ -192,33 +181,32 @@ def profile() -> etid.Profile:
     return etid.Profile("c_p", "farad", 0.12e-9, 0.024e-9, values, (logs / 0.2 - logs**2) ** 2)
 
 
-PICTURES: dict[str, Callable[[], tuple]] = {
-    "recording": lambda: (dry(),),
-    "recording_with_current": lambda: (with_current(),),
-    "fit": lambda: (fit(), dry(), driver()),
-    "fit_without_success": lambda: (fit("misfit"), dry(), driver()),
-    "measured_impedance": lambda: (measured(),),
-    "fit_impedance": lambda: (fit(), dry(), driver()),
-    "fit_residual": lambda: (fit(), dry(), driver()),
-    "selection": lambda: (selection(SkinRC="misfit"), spread(), driver()),
-    "calibration": lambda: (driver(), study()["calibration/98k8"]),
-    "driver": lambda: (driver(),),
-    "impedances": lambda: ({"Z_th": driver("order_too_low"), "skin": fit(), "typical": SKIN},),
-    "fits": lambda: (fits(),),
-    "posterior": lambda: (posterior(),),
-    "profile": lambda: (profile(),),
-    "bound": lambda: (bounds(),),
+PICTURES: dict[str, Callable[[], Figure]] = {
+    "recording": lambda: figure_of(dry()),
+    "recording_with_current": lambda: figure_of(with_current()),
+    "fit": lambda: figure_of(fit(), dry(), driver()),
+    "fit_without_success": lambda: figure_of(fit("misfit"), dry(), driver()),
+    "measured_impedance": lambda: figure_of(measured()),
+    "fit_impedance": lambda: figure_of(fit(), dry(), driver(), show="impedance"),
+    "fit_residual": lambda: figure_of(fit(), dry(), driver(), show="residual"),
+    "selection": lambda: figure_of(selection(SkinRC="misfit"), spread(), driver()),
+    "calibration": lambda: figure_of(driver(), study()["calibration/98k8"]),
+    "driver": lambda: figure_of(driver()),
+    "impedances": lambda: figure_of(
+        {"Z_th": driver("order_too_low"), "skin": fit(), "typical": SKIN}
+    ),
+    "fits": lambda: figure_of(fits()),
+    "posterior": lambda: figure_of(posterior()),
+    "profile": lambda: figure_of(profile()),
+    "bound": lambda: figure_of(bounds()),
 }
 
 
 def draw(name: str, path: pathlib.Path) -> None:
     """Write one picture as it is compared."""
-    import matplotlib as mpl
-
     with mpl.rc_context():
         mpl.rcdefaults()
-        show = {"fit_impedance": "impedance", "fit_residual": "residual"}.get(name, "pulse")
-        figure_of(*PICTURES[name](), show=show).savefig(path, dpi=DPI, metadata={"Software": None})
+        PICTURES[name]().savefig(path, dpi=DPI, metadata={"Software": None})
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 
 import numpy as np
 import pytest
@@ -58,8 +59,8 @@ class Stimulator:
         given: Amplitudes of all pulses.
     """
 
-    def __init__(self, electrodes, pause=0.0):
-        self.skin, self.given, self.pause = ["dry"] * electrodes, [], pause
+    def __init__(self, electrodes):
+        self.skin, self.given = ["dry"] * electrodes, []
         self.server = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.server.getsockname()[1]}"
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -79,7 +80,7 @@ class Stimulator:
                     begin = round((len(self.given) - 1) * PERIOD)
                     line.sendall(np.array([begin, *v.shape], "<i8").tobytes() + v.tobytes())
                     before = now
-                    time.sleep(self.pause)
+                    time.sleep(0.01)
 
 
 def controller_of(electrodes, **limits):
@@ -95,9 +96,14 @@ def tick_of(tracker, number=0, changes=(), *, stopped=False, reason="wanted"):
     return Tick(number, window, state, state, command, list(changes), stopped, 1e-3, 0, 0)
 
 
+def opened(electrodes=TEN, **options):
+    options = {"charge": WANTED, "controls": True, "port": 0} | options
+    return LiveView(controller_of(electrodes), **options)
+
+
 @pytest.fixture(scope="module")
 def view():
-    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as view:
+    with opened() as view:
         yield view
 
 
@@ -160,7 +166,7 @@ def test_a_request_that_is_not_the_page_s_is_refused(view, method, path, body, h
 
 
 def test_the_page_has_a_token_of_its_own_start_and_no_site_may_frame_it(view):
-    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as other:
+    with opened() as other:
         assert token_of(view) != token_of(other)
         headers = {HEADER: token_of(other), "Origin": other.address}
         assert asked(other, "POST", "/electrode", "3", **headers)[0] == 200
@@ -170,13 +176,10 @@ def test_the_page_has_a_token_of_its_own_start_and_no_site_may_frame_it(view):
         assert other.stopped
         assert shown(other)["stop"]
     assert not view.stopped
-    line = http.client.HTTPConnection("127.0.0.1", port_of(view), timeout=20)
-    line.request("GET", "/")
-    answer = line.getresponse()
-    assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
-    assert answer.headers["Access-Control-Allow-Origin"] is None
-    assert not re.search(r"(src|href)=\"?http|@import|url\(", answer.read().decode())
-    line.close()
+    with urllib.request.urlopen(view.address, timeout=20) as answer:
+        assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+        assert answer.headers["Access-Control-Allow-Origin"] is None
+        assert not re.search(r"(src|href)=\"?http|@import|url\(", answer.read().decode())
 
 
 def test_only_the_loopback_address_is_listened_at(view):
@@ -187,7 +190,7 @@ def test_only_the_loopback_address_is_listened_at(view):
 def test_alarms_are_words():
     tracker = tracker_of(TEN, 3e-3)
     changes = [Change(1, 4, "jump", "r_p", 0.0937), Change(1, None, "driver", "", np.nan)]
-    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as view:
+    with opened() as view:
         view.show(tick_of(tracker, 6, changes, reason="charge"))
         found = shown(view)
     assert set(found["words"]) == {"cap reached: charge"}
@@ -205,20 +208,16 @@ def test_alarms_are_words():
         ({"layout": Layout.grid(3, 3, 2e-3)}, "the layout has 9 electrodes, the display 10"),
         ({"port": 70_000}, "port is 70000; give a number from 0 to 65535"),
         ({"port": None}, r"port \d+ cannot be used .* does another live view run"),
+        ({}, r"needs tornado: pip install 'etid\[live\]'"),
     ],
 )
-def test_a_view_that_cannot_be_is_refused(view, options, text):
-    options = {"port": 0, **options}
-    if options["port"] is None:
-        options["port"] = port_of(view)
+def test_a_view_that_cannot_be_is_refused(view, options, text, monkeypatch):
+    if not options:
+        monkeypatch.setattr(views.importlib.util, "find_spec", lambda name: None)
+    if "port" in options:
+        options = {"port": options["port"] or port_of(view)}
     with pytest.raises(ValueError, match=text):
-        LiveView(controller_of(TEN), charge=WANTED, controls=True, **options)
-
-
-def test_a_missing_tornado_is_named_with_its_extra(monkeypatch):
-    monkeypatch.setattr(views.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"needs tornado: pip install 'etid\[live\]'"):
-        LiveView(controller_of(TEN), charge=WANTED, controls=True)
+        opened(**options)
 
 
 def resident(process):
@@ -231,7 +230,7 @@ def test_the_loop_waits_for_no_page_and_no_memory_grows(monkeypatch):
     """98 electrodes; a minute of snapshots while a page reads, then while its process is frozen."""
     monkeypatch.setattr(views, "EVERY", 0.0)
     tracker = tracker_of(DISPLAY, 3e-3)
-    with LiveView(controller_of(DISPLAY), charge=WANTED, controls=True, port=0) as view:
+    with opened(DISPLAY) as view:
         seconds, sizes, pid = [], [], view._process.pid
         assert pid is not None
 
@@ -265,7 +264,7 @@ def test_the_loop_waits_for_no_page_and_no_memory_grows(monkeypatch):
 
 def test_a_slow_tick_is_not_shown():
     tracker = tracker_of(TEN, 3e-3)
-    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as view:
+    with opened() as view:
         view.show(tick_of(tracker, 0))
         view._due = time.monotonic() - 0.1
         view.show(tick_of(tracker, 1)._replace(seconds=0.01))  # of 16.7 ms
@@ -276,7 +275,7 @@ def test_a_slow_tick_is_not_shown():
 
 
 def test_a_page_that_has_died_is_a_stop():
-    with LiveView(controller_of(TEN), charge=WANTED, controls=True, port=0) as view:
+    with opened() as view:
         assert not view.stopped
         view._process.kill()
         view._process.join()
@@ -345,7 +344,7 @@ def fill(name):
 
 
 def test_a_browser_shows_the_skin_and_stops_it():
-    controller, stimulator = controller_of(TEN), Stimulator(TEN, pause=0.01)
+    controller, stimulator = controller_of(TEN), Stimulator(TEN)
     with chromium() as browser:
         with LiveView(controller, charge=WANTED, controls=True, port=0) as view:
             with running(view, stimulator, controller) as (thread, ticks):

@@ -6,9 +6,9 @@ import pytest
 from matplotlib.collections import EllipseCollection
 
 import etid
-from etid.plotting import style
+from etid.plotting import figure_of
 from etid.plotting.layout import FINGERTIP, Layout, read_layout
-from etid.plotting.maps import draw_map
+from etid.plotting.style import new_figure
 from etid.recordings.errors import RecordingError
 from tests import pictures
 
@@ -22,10 +22,6 @@ def display():
     return dataclasses.replace(fits, labels={**fits.labels, "electrode": names, "session": days})
 
 
-def canvas(*layout, **options):
-    return style.new_figure(*layout, **options)[1]
-
-
 def test_the_display_of_the_paper_has_98_places_two_millimetres_apart():
     assert len(FINGERTIP.electrodes) == 98
     apart = np.hypot(FINGERTIP.x[:, None] - FINGERTIP.x, FINGERTIP.y[:, None] - FINGERTIP.y)
@@ -34,7 +30,8 @@ def test_the_display_of_the_paper_has_98_places_two_millimetres_apart():
 
 
 def test_each_day_has_a_map_and_values_lie_at_their_electrodes(display):
-    axes = draw_map(canvas, display, "r_p", FINGERTIP)
+    _, given = new_figure(1, 2, (6.0, 4.0))
+    axes = etid.plot(display, map="r_p", axes=given)
     for day, axis in enumerate(axes):
         [dots] = [one for one in axis.collections if isinstance(one, EllipseCollection)]
         rows = [3 * day, 3 * day + 1]
@@ -52,23 +49,20 @@ def test_each_day_has_a_map_and_values_lie_at_their_electrodes(display):
     assert len(scales) == 1
 
 
-def test_plot_draws_a_map_on_given_axes(display):
-    _, axes = style.new_figure(1, 2, (6.0, 4.0))
-    assert etid.plot(display, map="r_p", axes=axes).shape == (2,)
-    with pytest.raises(TypeError, match="map is for Fits"):
-        etid.plot(display[0], map="r_p")
-
-
 @pytest.mark.parametrize(
-    ("element", "layout", "message"),
+    ("options", "message"),
     [
-        ("r_q", FINGERTIP, "map is 'r_q', must be one of 'r_s', 'r_p', 'c_p'"),
-        ("r_p", Layout.grid(2, 2, 1e-3, "A1"), "electrode 'E1' is not in the layout"),
+        ({"map": "r_q"}, "map is 'r_q', must be one of 'r_s', 'r_p', 'c_p'"),
+        (
+            {"map": "r_p", "layout": Layout.grid(2, 2, 1e-3, "A1")},
+            "electrode 'E1' is not in the layout",
+        ),
+        ({"layout": FINGERTIP}, "map is for Fits, and layout for a map"),
     ],
 )
-def test_refusals_of_a_map(display, element, layout, message):
-    with pytest.raises(ValueError, match=message):
-        draw_map(canvas, display, element, layout)
+def test_refusals_of_a_map(display, options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        figure_of(display, **options)
 
 
 def test_a_layout_is_read_from_a_table_or_a_probe_file(tmp_path):

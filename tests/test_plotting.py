@@ -33,11 +33,19 @@ def test_a_picture_looks_as_it_did(name, tmp_path):
 
 
 def test_a_picture_without_a_curve_looks_different(tmp_path):
-    figure = figure_of(*pictures.PICTURES["driver"]())
+    figure = pictures.PICTURES["driver"]()
     figure.axes[0].lines[0].remove()
     figure.savefig(tmp_path / "driver.png", dpi=pictures.DPI)
     baseline = pictures.BASELINE / "driver.png"
     assert compare_images(str(baseline), str(tmp_path / "driver.png"), TOLERANCE) is not None
+
+
+def title(axis):
+    return axis.get_title(loc="left")
+
+
+def y(line):
+    return np.asarray(line.get_ydata())
 
 
 @pytest.fixture(scope="module")
@@ -48,18 +56,6 @@ def recording():
 @pytest.fixture(scope="module")
 def driver():
     return pictures.driver()
-
-
-def test_a_recording_is_shown_whole_and_by_one_pulse(recording):
-    whole, one = figure_of(recording).axes
-    np.testing.assert_array_equal(np.asarray(whole.lines[0].get_ydata()), recording.v_th)
-    np.testing.assert_array_equal(np.asarray(whole.lines[1].get_ydata()), recording.v_out)
-    shown = np.asarray(one.lines[0].get_ydata())
-    assert shown.size < 0.1 * recording.v_th.size
-    assert np.ptp(shown) > 0.8 * np.ptp(recording.v_th)
-    assert {axis.get_xlabel() for axis in (whole, one)} == {"time [ms]"}
-    assert {axis.get_ylabel() for axis in (whole, one)} == {"voltage [V]"}
-    assert "typical/dry/01" in whole.get_title(loc="left")
 
 
 def test_one_pulse_of_two_phases_is_shown_from_its_beginning():
@@ -84,22 +80,16 @@ def test_one_pulse_of_two_phases_is_shown_from_its_beginning():
 def test_a_fit_shows_its_residual_in_millivolts_in_a_band_of_two_sigma(recording, driver):
     fit = pictures.fit()
     upper, lower = figure_of(fit, recording, driver).axes
-    assert (upper.get_ylabel(), lower.get_ylabel()) == ("voltage [V]", "residual [mV]")
-    predicted, measured = (np.asarray(upper.lines[i].get_ydata()) for i in (2, 1))
-    np.testing.assert_allclose(
-        np.asarray(lower.lines[-1].get_ydata()), 1e3 * (predicted - measured)
-    )
+    np.testing.assert_allclose(y(lower.lines[-1]), 1e3 * (y(upper.lines[2]) - y(upper.lines[1])))
     (band,) = lower.patches
     assert isinstance(band, Rectangle)
-    bottom, height = band.get_xy()[1], band.get_height()
-    sigma = residual_std(recording, driver, fit.circuit)
-    np.testing.assert_allclose((bottom, height), (-2e3 * sigma, 4e3 * sigma))
-    title = upper.get_title(loc="left")
-    assert "successful" in title
-    assert r"$R_\mathrm{s}$ 33.40 ± 0.67 kΩ" in title
+    sigma = 1e3 * residual_std(recording, driver, fit.circuit)
+    np.testing.assert_allclose((band.get_y(), band.get_height()), (-2 * sigma, 4 * sigma))
+    assert r"successful, chi2 1.02, RRSE 0.1 %" in title(upper)
+    assert r"$R_\mathrm{s}$ 33.40 ± 0.67 kΩ" in title(upper)
     for given, shown in ((None, ""), ("dry", "dry")):
         drawn = etid.plot(fit, recording, driver, title=given)
-        assert [axis.get_title(loc="left") for axis in drawn] == [shown, ""]
+        assert [title(axis) for axis in drawn] == [shown, ""]
 
 
 def test_the_band_is_that_of_the_noise_of_both_records(driver):
@@ -116,15 +106,19 @@ def test_the_band_is_that_of_the_noise_of_both_records(driver):
 
 
 def test_what_did_not_succeed_looks_so(recording, driver):
-    upper, _ = figure_of(pictures.fit("misfit"), recording, driver).axes
-    assert "no success: misfit" in upper.get_title(loc="left")
-    assert to_hex(upper._left_title.get_color()) == RED  # pyright: ignore[reportAttributeAccessIssue]
     nothing = pictures.SKIN.with_log_values(jnp.full(3, jnp.nan))
-    upper, lower = figure_of(pictures.fit("too_short", nothing), recording, driver).axes
-    assert "nan" not in upper.get_title(loc="left")
-    assert [text.get_text() for text in lower.texts] == ["no elements, nothing predicted"]
-    magnitude, _ = figure_of(pictures.driver("order_too_low")).axes
-    assert "no success: order_too_low" in magnitude.get_title(loc="left")
+    misfit, too_short = pictures.fit("misfit"), pictures.fit("too_short", nothing)
+    for figure, verdict in (
+        (figure_of(misfit, recording, driver), "misfit"),
+        (figure_of(too_short, recording, driver), "too_short"),
+        (figure_of(pictures.driver("order_too_low")), "order_too_low"),
+    ):
+        upper, lower = figure.axes
+        assert f"no success: {verdict}" in title(upper)
+        assert "nan" not in title(upper)
+        assert to_hex(upper._left_title.get_color()) == RED  # pyright: ignore[reportAttributeAccessIssue]
+        told = ["no elements, nothing predicted"] if verdict == "too_short" else []
+        assert [text.get_text() for text in lower.texts] == told
 
 
 @pytest.fixture(scope="module")
@@ -153,16 +147,12 @@ def test_bands_of_a_recording_deviate_from_its_circuit_by_noise_alone(found):
 
 def test_a_selection_shows_what_is_measured_and_each_candidate(driver, found):
     selection = pictures.selection(SkinRC="misfit")
-    magnitude, phase, of_size, of_phase = figure_of(selection, pictures.spread(), driver).axes
-    assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("|Z| [kΩ]", "phase [deg]")
-    points = magnitude.lines[0]
+    magnitude, _, of_size, of_phase = figure_of(selection, pictures.spread(), driver).axes
     lines = [line for line in magnitude.lines if not str(line.get_label()).startswith("_")]
-    np.testing.assert_allclose(
-        np.asarray(points.get_ydata()), np.abs(found[0].z[found[0].stderr <= CLEAR]) / 1e3
-    )
-    kilohertz, size = (np.asarray(of, float) for of in lines[0].get_data())
-    z = np.asarray(pictures.SPREAD.response(jnp.asarray(1e3 * kilohertz)))
-    np.testing.assert_allclose(size, np.abs(z) / 1e3)
+    sure = found[0].z[found[0].stderr <= CLEAR]
+    np.testing.assert_allclose(y(magnitude.lines[0]), np.abs(sure) / 1e3)
+    z = np.asarray(pictures.SPREAD.response(1e3 * jnp.asarray(lines[0].get_xdata())))
+    np.testing.assert_allclose(y(lines[0]), np.abs(z) / 1e3)
     assert [line.get_label() for line in lines] == [
         "SkinCole, chosen",
         "SkinRC, 2 log evidence -592, misfit",
@@ -170,61 +160,37 @@ def test_a_selection_shows_what_is_measured_and_each_candidate(driver, found):
     assert lines[0].get_linewidth() > lines[1].get_linewidth()
     for part, axis in enumerate((of_size, of_phase)):
         for line, of in zip(list(axis.lines)[1:], found, strict=True):
-            np.testing.assert_allclose(np.asarray(line.get_ydata()), of.deviation[part])
-    title = magnitude.get_title(loc="left")
-    assert "successful" in title
-    assert "alpha" in title
+            np.testing.assert_allclose(y(line), of.deviation[part])
+    assert all(word in title(magnitude) for word in ("successful", "SkinCole", "alpha"))
 
 
 def test_an_impedance_is_in_kilohms_and_degrees_in_a_band_of_two_standard_errors(driver):
     magnitude, phase = figure_of({"Z_th": driver}).axes
-    kilohertz, size = (np.asarray(of, float) for of in magnitude.lines[0].get_data())
-    z = np.asarray(driver.response(jnp.asarray(kilohertz) * 1e3))
-    np.testing.assert_allclose(size, np.abs(z) / 1e3)
-    np.testing.assert_allclose(np.asarray(phase.lines[0].get_ydata()), np.degrees(np.angle(z)))
-    assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("|Z| [kΩ]", "phase [deg]")
-    assert phase.get_xlabel() == "frequency [kHz]"
+    frequency = 1e3 * jnp.asarray(magnitude.lines[0].get_xdata())
+    z = np.asarray(driver.response(frequency))
+    np.testing.assert_allclose(y(magnitude.lines[0]), np.abs(z) / 1e3)
+    np.testing.assert_allclose(y(phase.lines[0]), np.degrees(np.angle(z)))
     (band,) = magnitude.collections
-    relative = np.asarray(driver.response_stderr(jnp.asarray(kilohertz) * 1e3)) / np.abs(z)
-    vertices = band.get_paths()[0].vertices
-    assert vertices is not None
-    top = np.asarray(vertices)[:, 1].max()
-    peak = np.argmax(size * np.exp(2 * relative))
-    assert top == pytest.approx(size[peak] * np.exp(2 * relative[peak]), rel=1e-6)
+    top = np.abs(z) / 1e3 * np.exp(2 * np.asarray(driver.response_stderr(frequency)) / np.abs(z))
+    assert np.asarray(band.get_paths()[0].vertices)[:, 1].max() == pytest.approx(max(top), rel=1e-6)
     # A circuit without a covariance has no band.
     assert not figure_of(pictures.SKIN).axes[0].collections
 
 
 def test_fits_are_by_subject_and_failures_hollow():
     fits = pictures.fits()
-    axes = figure_of(fits).axes
-    assert [axis.get_ylabel() for axis in axes] == [
-        rf"${letter}_\mathrm{{{index}}}$ [{unit}]"
-        for letter, index, unit in (("R", "s", "kΩ"), ("R", "p", "kΩ"), ("C", "p", "nF"))
-    ]
-    lines = [line for line in axes[0].lines if len(np.asarray(line.get_ydata()))]
+    axis = figure_of(fits).axes[0]
+    lines = [line for line in axis.lines if y(line).size]
     points = [line for line in lines if line.get_marker() != "_"]
-    by_face = {
-        hollow: np.concatenate(
-            [
-                np.asarray(line.get_ydata())
-                for line in points
-                if (line.get_markerfacecolor() == "white") == hollow
-            ]
-        )
-        for hollow in (True, False)
-    }
     values = np.asarray(fits.circuit.r_s) / 1e3
-    good = fits.verdicts == "successful"
-    np.testing.assert_allclose(np.sort(by_face[False]), np.sort(values[good]))
-    np.testing.assert_allclose(np.sort(by_face[True]), np.sort(values[~good]))
-    assert [label.get_text() for label in axes[-1].get_xticklabels()] == ["s01", "s02"]
+    for hollow in (False, True):
+        drawn = [y(line) for line in points if (line.get_markerfacecolor() == "white") == hollow]
+        expected = values[(fits.verdicts != "successful") == hollow]
+        np.testing.assert_allclose(np.sort(np.concatenate(drawn)), np.sort(expected))
     (medians,) = set(lines) - set(points)
     groups = [one for one in fits.summary("subject", "condition") if one["successful"] > 2]
-    np.testing.assert_allclose(
-        np.asarray(medians.get_ydata()), [one["r_s"] / 1e3 for one in groups]
-    )
-    (bars,) = axes[0].containers[-1][2]
+    np.testing.assert_allclose(y(medians), [one["r_s"] / 1e3 for one in groups])
+    (bars,) = axis.containers[-1][2]
     lengths = [np.ptp(segment[:, 1]) for segment in bars.get_segments()]
     np.testing.assert_allclose(lengths, [2e-3 * one["r_s_between"] for one in groups])
 
@@ -243,11 +209,11 @@ def test_fits_are_by_any_two_labels():
 
 def test_a_bound_shows_per_cent_and_what_is_undetermined():
     (axis,) = figure_of(pictures.bounds()).axes
-    assert axis.get_xlabel() == "smallest relative standard error [%]"
-    assert "1 of 2 recordings leave an element undetermined" in axis.get_title(loc="left")
-    drawn = np.concatenate([line.get_xdata() for line in axis.lines if line.get_marker() != "None"])
-    assert {40.0, 2.0, 300.0} <= set(np.round(drawn, 6))
-    assert len(figure_of(pictures.bounds()["noisy"]).axes) == 1
+    assert "1 of 2 recordings leave an element undetermined" in title(axis)
+    points = [line for line in axis.lines if line.get_marker() != "None"]
+    noisy = [(np.asarray(line.get_xdata()), line.get_markerfacecolor()) for line in points[1::2]]
+    assert [round(size.item()) for size, _ in noisy] == [40, 2, 300]
+    assert [face == "white" for _, face in noisy] == [False, False, True]
 
 
 def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, monkeypatch):
@@ -264,12 +230,6 @@ def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, 
     plt.close(new)
 
 
-def _segments(axis):
-    (lines,) = axis.collections
-    assert isinstance(lines, LineCollection)
-    return lines.get_segments()
-
-
 def test_the_residual_of_a_wrong_circuit_correlates_with_the_unloaded_voltage(recording, driver):
     outside = []
     for circuit in (pictures.SKIN, etid.SkinRC(30e3, 150e3, 0.2e-9)):
@@ -277,9 +237,10 @@ def test_the_residual_of_a_wrong_circuit_correlates_with_the_unloaded_voltage(re
         _, own, with_input = figure_of(fit, recording, driver, show="residual").axes
         (band,) = with_input.patches
         assert isinstance(band, Rectangle)
-        limit = band.get_height() / 2
-        lines = np.array([segment[1][1] for segment in _segments(with_input)])
-        outside.append(np.mean(np.abs(lines) > limit))
-        middle = np.array([segment[1] for segment in _segments(own)])
-        assert middle[middle[:, 0] == 0, 1] == pytest.approx(1.0)
+        (of_input,), (of_own,) = with_input.collections, own.collections
+        assert isinstance(of_input, LineCollection)
+        assert isinstance(of_own, LineCollection)
+        ends = np.array([segment[1] for segment in of_input.get_segments()])
+        outside.append(np.mean(np.abs(ends[:, 1]) > band.get_height() / 2))
+        assert dict(segment[1] for segment in of_own.get_segments())[0.0] == pytest.approx(1.0)
     assert outside[0] < 0.05 < 0.5 < outside[1]

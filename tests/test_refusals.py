@@ -160,6 +160,7 @@ figure_of(pictures.selection()) -> plot\(selection, recording, driver\)
 figure_of(of.driver, of.skin) -> no r_load
 figure_of('recording') -> cannot draw str
 figure_of(of.fit, by=('session', 'subject')) -> by is for Fits without a map
+figure_of(of.fit, map='r_p') -> map is for Fits
 figure_of({}) -> a dictionary of nothing
 """
 

@@ -1,115 +1,37 @@
-"""Tables and pages, and the arithmetic of the demo's tables."""
+"""The arithmetic of the demo's tables."""
 
-import html.parser
-import re
+import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
 from etid.paper import demo, tables
-from etid.report import html as report
-from etid.results.driver import DiscreteDriver
-from etid.results.verdicts import verdict, verdicts_of
+from tests import pictures
 
 EXCESS = 1.1  # of every identified element over the true one
 
 
-@pytest.mark.parametrize(
-    ("rows", "groups", "message"),
-    [((("1",),), (), "1 cells for 2 columns"), ((), (("x", 1),), "span 1 columns of 2")],
-)
-def test_a_table_refuses_rows_and_headings_that_do_not_cover_it(rows, groups, message):
-    with pytest.raises(ValueError, match=message):
-        report.Table(("a", "b"), rows, groups)
-
-
-class _Balance(html.parser.HTMLParser):
-    """Fails on an element that is not closed where it was opened."""
-
-    def __init__(self):
-        super().__init__()
-        self.open = []
-
-    def handle_starttag(self, tag, attrs):
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-
-def test_page_is_whole_escaped_and_needs_no_other_file(tmp_path):
-    picture = report.Picture("caption <c>", b"<svg xmlns='http://www.w3.org/2000/svg'/>", 'a "b"')
-    table = report.Table(("x", "y"), (("<1>", "2"),), (("", 1), ("<g>", 1)), "of <t>")
-    section = report.Section(
-        "R < 1", "a & `b < c`", (table,), (picture,), "<w>", "in full", "@x{<key>}"
-    )
-    report.write_page(tmp_path / "page.html", "Title <t>", "text", [section])
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    parser = _Balance()
-    parser.feed(page)
-    assert parser.open == []
-    for escaped in (
-        "Title &lt;t&gt;", "R &lt; 1", "a &amp; <code>b &lt; c</code>",
-        "&lt;1&gt;", "&lt;g&gt;", "of &lt;t&gt;",
-        "caption &lt;c&gt;", "a &#34;b&#34;", "&lt;w&gt;", "@x{&lt;key&gt;}",
-    ):  # fmt: skip
-        assert escaped in page
-    assert all(source.startswith("data:") for source in re.findall(r'src="([^"]*)"', page))
-    assert re.findall(r'href="([^"]*)"', page) == ["#r-1"]
-    assert 'id="r-1"' in page
-
-
-def _fits(circuit, paths, elements, excess):
-    """Fits of which every element is `excess` times the true one, half successful."""
-    study = etid.scenes.paper()
-    labels = {trial.path: trial for trial in study.trials}
-    values = {
-        name: np.array([excess * element[name] for element in elements]) for name in circuit.names()
-    }
-    size, count = len(values), len(paths)
-    cov = np.zeros((count, size, size))
-    cov[:, range(size), range(size)] = np.stack(list(values.values()), -1) ** 2  # 100 % error
-    verdicts = np.array(["successful", "misfit"] * count)[:count]
-    fit = etid.Fit(
-        circuit=circuit(**values),
-        cov=cov,
-        shared_cov=0 * cov,
-        rrse=np.full(count, 0.05),
-        chi2=np.ones(count),
-        result=verdicts_of(verdicts),
-        steps=np.ones(count, int),
-        method="output_error",
-        remarks=np.zeros(count, int),
-    )
-    names = ("path", "subject", "condition", "electrode", "trial")
-    columns = {name: np.array([getattr(labels[path], name) for path in paths]) for name in names}
-    return etid.Fits(fit, columns, np.full(count, ""))
-
-
-def _outcome(excess):
-    truth = etid.scenes.paper().truth()
-    skins = [path for path in truth if "r_s" in truth[path]]
-    resistors = [path for path in truth if path.startswith("resistors/")]
-    driver = DiscreteDriver(
-        b=jnp.ones(2), a=jnp.ones(2), sample_rate=2e5,
-        rrse=jnp.array(0.1), chi2=jnp.array(1.0), result=verdict("successful"), steps=jnp.array(1),
-        method="by hand",
-    )  # fmt: skip
-    return tables.Outcome(
-        "quiet",
-        "output_error",
-        driver,
-        _fits(etid.SkinRC, skins, [truth[path] for path in skins], excess),
-        _fits(etid.Resistor, resistors, [truth[path] for path in resistors], excess),
-    )
-
-
 @pytest.fixture
 def outcome():
-    return _outcome(EXCESS)
+    """Every element `EXCESS` times the true one with an error of 100 %; half of it successful."""
+    scene = etid.scenes.paper()
+    truth, trials = scene.truth(), {trial.path: trial for trial in scene.trials}
+
+    def fits(circuit, paths):
+        values = [EXCESS * np.array([truth[path][name] for path in paths])
+                  for name in circuit.names()]  # fmt: skip
+        verdicts = np.resize(["successful", "misfit"], len(paths))
+        fit = dataclasses.replace(
+            pictures.fit(verdicts, circuit(*values), 1.0), rrse=np.full(len(paths), 0.05)
+        )
+        names = ("path", "subject", "condition", "electrode", "trial")
+        labels = {name: np.array([getattr(trials[path], name) for path in paths]) for name in names}
+        return pictures.fits_of(fit, **labels)
+
+    skins = fits(etid.SkinRC, [path for path in truth if "r_s" in truth[path]])
+    resistors = fits(etid.Resistor, [path for path in truth if path.startswith("resistors/")])
+    return tables.Outcome("quiet", "output_error", pictures.driver(), skins, resistors)
 
 
 def test_demo_tables_show_the_error_that_was_made(outcome):

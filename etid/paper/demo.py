@@ -30,15 +30,19 @@ from etid.paper.tables import (
     Outcome,
     Truth,
     errors,
-    fingertips,
     identify,
     resistor_errors,
 )
 from etid.plotting import figure_of
 from etid.plotting.style import save
 from etid.recordings.replacing import replace_text
-from etid.report.html import Picture, Section, Table, number, write_page
+from etid.report.html import Picture, Section, Table, write_page
 from etid.simulation.published import FINGERTIPS, RRSE, TABLE_1, TABLE_4
+
+
+def _number(value: float | np.floating) -> str:
+    """A number with two decimals, or with three digits if it is 10 000 or more."""
+    return f"{value:.2f}" if abs(value) < 1e4 else f"{value:.3g}"
 
 
 def _successes(fits: etid.Fits) -> str:
@@ -50,7 +54,7 @@ def table_1(outcomes: Sequence[Outcome]) -> Table:
     heads = tuple(f"{name} {outcome.method}" for outcome in outcomes for name in outcome.names[:1])
     found = [resistor_errors(outcome) for outcome in outcomes]
     rows = tuple(
-        (f"{r / 1e3:g}", f"{paper:g}", *(number(errors_of[r]) for errors_of in found))
+        (f"{r / 1e3:g}", f"{paper:g}", *(_number(errors_of[r]) for errors_of in found))
         for r, paper in TABLE_1.items()
     )
     return Table(("R [kΩ]", "paper", *heads), rows)
@@ -60,43 +64,39 @@ def table_fingertips(outcomes: Sequence[Outcome], truth: Truth, condition: str) 
     """Table II (dry) or III (damp): elements and errors of a typical fingertip and ten subjects."""
     rows = []
     units = etid.SkinRC.units()
+    span = "{:.3g} to {:.3g}".format
     for name in ORDER:
         scale, symbol = DISPLAY[units[name]]
         typical, *limits = (value / scale for value in FINGERTIPS[condition][name])
         label = f"{name} [{symbol}]"
-        span = "{:.3g} to {:.3g}".format
         rows.append(("paper", "", label, f"{typical:.3g}", "", "", span(*limits), "", "", ""))
         for outcome in outcomes:
             skins = outcome.skins.where(condition=condition)
-            found = fingertips(skins, truth, name)
-            rows.append(
-                (
-                    *outcome.names,
-                    label,
-                    f"{found.typical / scale:.4g}",
-                    number(found.error),
-                    number(found.spread),
-                    span(found.lowest / scale, found.highest / scale),
-                    number(found.subject_error),
-                    number(found.worst),
-                    _successes(skins),
-                )
-            )
-    return Table(
-        (
-            "records",
-            "method",
-            "element",
-            "typical",
-            "error [%]",
-            "spread [%]",
-            "subjects",
-            "error [%]",
-            "worst [%]",
-            "successful",
-        ),
-        tuple(rows),
-    )
+            trials = skins.where(subject="typical")
+            values, error = np.asarray(getattr(trials.circuit, name)), errors(trials, truth)[name]
+            subjects = [
+                skins.where(subject=subject)
+                for subject in np.unique(skins.labels["subject"])
+                if subject != "typical"
+            ]
+            medians = np.array([np.median(getattr(of.circuit, name)) for of in subjects])
+            actual = np.array([truth[str(of.labels["path"][0])][name] for of in subjects])
+            off = 100 * np.abs(medians / actual - 1)
+            rows.append((
+                *outcome.names, label,
+                f"{np.median(values) / scale:.4g}",
+                _number(np.median(error)),
+                _number(np.std(error, ddof=1)),
+                span(medians.min() / scale, medians.max() / scale),
+                _number(np.median(off)),
+                _number(off.max()),
+                _successes(skins),
+            ))  # fmt: skip
+    heads = (
+        "records", "method", "element", "typical", "error [%]", "spread [%]", "subjects",
+        "error [%]", "worst [%]", "successful",
+    )  # fmt: skip
+    return Table(heads, tuple(rows))
 
 
 def table_4(outcomes: Sequence[Outcome], truth: Truth) -> Table:
@@ -107,10 +107,10 @@ def table_4(outcomes: Sequence[Outcome], truth: Truth) -> Table:
         built = outcome.skins.where(condition="built")
         found = errors(built, truth)
         cells = [
-            f"{number(np.mean(found[name]))} / {number(np.std(found[name], ddof=1))}"
+            f"{_number(np.mean(found[name]))} / {_number(np.std(found[name], ddof=1))}"
             for name in ORDER
         ]
-        quality = number(100 * float(np.median(built.rrse)))
+        quality = _number(100 * float(np.median(built.rrse)))
         rows.append((*outcome.names, *cells, quality, _successes(built)))
     heads = tuple(f"{name} [%]" for name in ORDER)
     return Table(("records", "method", *heads, "RRSE [%]", "successful"), tuple(rows))
@@ -140,38 +140,33 @@ def figures(folder: pathlib.Path, study: etid.Study, outcome: Outcome) -> tuple[
         The figures as SVG, with captions, for the page.
     """
     folder.mkdir(exist_ok=True)
-    driver, calibration = outcome.driver, study[CALIBRATION]
-    skins = {
-        condition: outcome.skins.where(path=f"typical/{condition}/01")[0]
-        for condition in FINGERTIPS
-    }
+    driver = outcome.driver
+    dry, damp = (outcome.skins.where(path=f"typical/{name}/01")[0] for name in ("dry", "damp"))
     fingertips = outcome.skins.take(outcome.skins.labels["subject"] != "")
     pictures: dict[str, tuple[str, tuple[Any, ...]]] = {
         "pulse_calibration": (
             "Calibration with 98.8 kΩ: measured, predicted, residual (paper, figure 7)",
-            (driver, calibration),
+            (driver, study[CALIBRATION]),
         ),
-        **{
-            f"pulse_{condition}": (
-                f"A {condition} fingertip: measured, predicted, residual (paper, figure 8)",
-                (skin, study[f"typical/{condition}/01"], driver),
-            )
-            for condition, skin in skins.items()
-        },
+        "pulse_dry": (
+            "A dry fingertip: measured, predicted, residual (paper, figure 8)",
+            (dry, study["typical/dry/01"], driver),
+        ),
+        "pulse_damp": (
+            "A damp fingertip: measured, predicted, residual (paper, figure 8)",
+            (damp, study["typical/damp/01"], driver),
+        ),
         "impedance": (
             "Source impedance and the impedances of a dry and a damp fingertip (paper, figure 9)",
-            (
-                {"Z_th": driver}
-                | {f"Z_bio, {condition}": skin for condition, skin in skins.items()},
-            ),
+            ({"Z_th": driver, "Z_bio, dry": dry, "Z_bio, damp": damp},),
         ),
         "elements": ("Elements of all trials by subject, with standard errors", (fingertips,)),
     }
     drawn = []
     for name, (caption, arguments) in pictures.items():
         figure = figure_of(*arguments)
-        for suffix in (".png", ".svg"):
-            save(figure, folder / f"{name}{suffix}")
+        save(figure, folder / f"{name}.png")
+        save(figure, folder / f"{name}.svg")
         drawn.append(Picture(caption, (folder / f"{name}.svg").read_bytes()))
     return tuple(drawn)
 

@@ -5,7 +5,7 @@ matplotlib.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, get_args, overload
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -20,72 +20,22 @@ from etid.results.posterior import Posterior, Profile
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
 
+Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
 if TYPE_CHECKING:
-    import matplotlib.axes
     import matplotlib.figure
 
     from etid.plotting.layout import Layout
     from etid.plotting.style import Canvas
 
-Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
+    One = Recording | Fits | Selection | Posterior | Profile | Bound | Impedance
+    Drawable = One | Mapping[str, Bound] | Mapping[str, Impedance]
+else:
+    Drawable = Any
 
 
-@overload
-def plot(
-    x: Recording, *, axes: AnyAxes = None, size: Size = None, title: str | None = ""
-) -> np.ndarray: ...
-@overload
-def plot(
-    x: Fit,
-    recording: Recording | None = None,
-    driver: Driver | None = None,
-    *,
-    axes: AnyAxes = None,
-    size: Size = None,
-    title: str | None = "",
-    show: Shown = "pulse",
-) -> np.ndarray: ...
-@overload
-def plot(
-    x: Selection,
-    recording: Recording,
-    driver: Driver,
-    *,
-    axes: AnyAxes = None,
-    size: Size = None,
-    title: str | None = "",
-) -> np.ndarray: ...
-@overload
-def plot(
-    x: Driver,
-    recording: Recording,
-    *,
-    axes: AnyAxes = None,
-    size: Size = None,
-    title: str | None = "",
-) -> np.ndarray: ...
-@overload
-def plot(
-    x: Fits,
-    *,
-    axes: AnyAxes = None,
-    size: Size = None,
-    title: str | None = "",
-    by: Sequence[str] | None = None,
-    map: str | None = None,
-    layout: "Layout | None" = None,
-) -> np.ndarray: ...
-@overload
-def plot(
-    x: Impedance | Mapping[str, Impedance] | Posterior | Profile | Bound | Mapping[str, Bound],
-    *,
-    axes: AnyAxes = None,
-    size: Size = None,
-    title: str | None = "",
-) -> np.ndarray: ...
 @in_float64
 def plot(
-    x: Any,
+    x: Drawable,
     recording: Recording | None = None,
     driver: Driver | None = None,
     *,
@@ -159,27 +109,35 @@ def plot(
         ValueError: `x` is empty, the picture needs another number of axes, or `size` is given
             together with `axes`.
     """
-    from etid.plotting import style
+    from etid.plotting.style import new_figure, titled
 
     if axes is not None and size is not None:
         raise ValueError("size is that of a new figure; set the size of the figure of your axes")
-    canvas = style.on_pyplot(size) if axes is None else style.on_axes(axes)
+    given = None if axes is None else np.asarray(axes, dtype=object).ravel()
+
+    def canvas(rows: int, columns: int, usual: tuple[float, float], **options: Any) -> np.ndarray:
+        if given is None:
+            return new_figure(rows, columns, size or usual, pyplot=True, **options)[1]
+        if given.size != rows * columns:
+            raise ValueError(f"axes holds {given.size} Axes; this picture takes {rows * columns}")
+        return given.reshape(rows, columns)
+
     drawn = _draw(canvas, x, recording, driver, show=show, by=by, map=map, layout=layout)
     if title != "":
         for axis in drawn.flat:
             axis.set_title("", loc="left")
-        style.titled(drawn.flat[0], [title or ""])
+        titled(drawn.flat[0], [title or ""])
     return drawn
 
 
 def figure_of(
-    x: Any, recording: Recording | None = None, driver: Driver | None = None, **options: Any
+    x: Drawable, recording: Recording | None = None, driver: Driver | None = None, **options: Any
 ) -> "matplotlib.figure.Figure":
     """The picture of `plot`, on a figure outside of `matplotlib.pyplot`; same arguments."""
-    from etid.plotting import style
+    from etid.plotting.style import new_figure
 
     def canvas(*grid: Any, **options: Any) -> np.ndarray:
-        return style.new_figure(*grid, **options)[1]
+        return new_figure(*grid, **options)[1]
 
     return _draw(canvas, x, recording, driver, **options)[0].figure
 
@@ -209,6 +167,14 @@ def _draw(
         raise TypeError("map is for Fits, and layout for a map: plot(fits, map='r_p')")
     if by is not None and (is_map or not isinstance(x, Fits)):
         raise TypeError("by is for Fits without a map: plot(fits, by=('session', 'subject'))")
+    if isinstance(x, Fits) and not len(x):
+        raise ValueError("there are no fits to draw")
+    for one in x.values() if isinstance(x, dict) else [x]:
+        if isinstance(one, Fit) and np.ndim(one.rrse):
+            raise TypeError(
+                f"this is a batch of {np.shape(one.rrse)} fits; draw one fit, fits[i], or all of "
+                "them, plot(fits)"
+            )
     if isinstance(x, Fit):
         recording, driver = x.source_or_own(recording, driver)
         if recording is None and x.measured is not None and show == "residual":
@@ -251,29 +217,25 @@ def _draw(
                 return elements.draw_profile(canvas, x)
             case Bound(), None, None:
                 return elements.draw_bounds(canvas, [x])
-            case ((Driver() | SourceImpedance()), None, None):
-                return impedances.draw_bode(canvas, {"Z_th": x})
-            case AbstractCircuit(), None, None:
-                return impedances.draw_bode(canvas, {type(x).__name__: x})
+            case ((Driver() | SourceImpedance() | AbstractCircuit()), None, None):
+                name = type(x).__name__ if isinstance(x, AbstractCircuit) else "Z_th"
+                return impedances.draw_bode(canvas, {name: x})
             case dict(), None, None if x and all(isinstance(y, Bound) for y in x.values()):
                 return elements.draw_bounds(canvas, list(x.values()))
             case dict(), None, None if x and all(isinstance(y, Impedance) for y in x.values()):
                 return impedances.draw_bode(canvas, x)
+    given = " with ".join(_kind(one) for one in (x, recording, driver) if one is not None)
     raise TypeError(
-        f"cannot draw {_kinds(x, recording, driver)}; plot takes a Recording, a Fit or Selection "
+        f"cannot draw {given}; plot takes a Recording, a Fit or Selection "
         "with its recording and driver, a Driver alone or with a calibration, a circuit, Fits, a "
         "Posterior, a Profile, a Bound, a dictionary of bounds, or a dictionary of drivers, fits "
         "and circuits"
     )
 
 
-def _kinds(*arguments: Any) -> str:
-    """Names of the types of the arguments, and of the values in dictionaries."""
-    words = []
-    for x in arguments:
-        if isinstance(x, dict):
-            inside = ", ".join(sorted({type(value).__name__ for value in x.values()}))
-            words.append(f"a dictionary of {inside or 'nothing'}")
-        elif x is not None:
-            words.append(type(x).__name__)
-    return " with ".join(words)
+def _kind(x: Any) -> str:
+    """The type of an argument, and those of the values of a dictionary."""
+    if not isinstance(x, dict):
+        return type(x).__name__
+    inside = ", ".join(sorted({type(value).__name__ for value in x.values()}))
+    return f"a dictionary of {inside or 'nothing'}"

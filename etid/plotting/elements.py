@@ -2,11 +2,11 @@
 
 import statistics
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 
 from etid.circuits.display import DISPLAY
 from etid.plotting.style import (
@@ -17,6 +17,9 @@ from etid.plotting.style import (
     RED,
     Canvas,
     drawable,
+    key,
+    nth,
+    plain,
     plain_ticks,
     symbol,
     titled,
@@ -36,11 +39,9 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     A thick bar is the median of a group with the variation between its fits beyond their errors.
 
     Raises:
-        ValueError: There are no fits, or `by` is not two labels.
+        ValueError: `by` is not two labels.
         RecordingError: There is no such label.
     """
-    if not len(fits):
-        raise ValueError("there are no fits to draw")
     if isinstance(by, str) or len(by) != 2:
         raise ValueError(f"by is {by!r}, must be two labels, such as ('session', 'subject')")
     check_names(dict.fromkeys(by), LABELS, "label")
@@ -49,22 +50,31 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     labels, second = (fits.labels[name].astype(str) for name in by)
     groups, place = np.unique(labels, return_inverse=True)
     series = np.unique(second).tolist()
-    x = _side_by_side(place, second, series)
+    width = 0.8 / len(series)
+    beside = {label: (i + 0.5) * width - 0.4 for i, label in enumerate(series)}
+    x = place + np.array([beside[label] for label in second.tolist()])
+    for label in series:
+        for group in range(groups.size):
+            (trials,) = np.nonzero((second == label) & (place == group))
+            if trials.size > 1:
+                x[trials] += width * np.linspace(-0.35, 0.35, trials.size)
     summary = [one for one in fits.summary(*by) if one["successful"] >= FEW]
-    middle = [
-        groups.tolist().index(one[by[0]]) + _offset(series.index(one[by[1]]), len(series))
-        for one in summary
-    ]
+    middle = [groups.tolist().index(one[by[0]]) + beside[one[by[1]]] for one in summary]
     good = fits.verdicts == "successful"
     for axis, (name, unit) in zip(axes, units.items(), strict=True):
         scale = DISPLAY[unit][0]
         values = np.asarray(getattr(fits.circuit, name)) / scale
         errors = np.asarray(getattr(fits.stderr, name)) / scale
+        errors = np.where(np.isfinite(errors), errors, 0.0)
         known = drawable(values)
         for i, label in enumerate(series):
-            of = known & (second == label)
-            _points(axis, x, values, errors, of & good, i, label, hollow=False)
-            _points(axis, x, values, errors, of & ~good, i, label, hollow=True)
+            colour, mark = nth(COLOURS, i), nth(MARKS, i)
+            for of, face in ((good, colour), (~good, "white")):
+                some = known & (second == label) & of
+                axis.errorbar(
+                    x[some], values[some], errors[some], fmt=mark, ms=4, lw=0.8, color=colour,
+                    markerfacecolor=face,
+                )  # fmt: skip
         medians, between = (
             np.array([one[name + part] for one in summary]) / scale for part in ("", "_between")
         )
@@ -84,15 +94,15 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
         if len(fits) <= 40:  # there is room for the names of the trials
             for row in np.flatnonzero(shown):
                 axis.annotate(
-                    str(fits.labels["trial"][row]), (x[row], values[row]), xytext=(4, 3),
+                    plain(str(fits.labels["trial"][row])), (x[row], values[row]), xytext=(4, 3),
                     textcoords="offset points", fontsize=7, color="0.35",
                 )  # fmt: skip
         axis.set_ylabel(symbol(name, unit))
-    names = [one or "-" for one in groups.tolist()]
+    names = [plain(one) or "-" for one in groups.tolist()]
     turned = sum(map(len, names)) > 60
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
     axes[-1].set_xlabel(by[0])
-    _legend(axes[0], series, "" if good.all() else "without success")
+    _legend(axes[0], series, "" if good.all() else "without success", ncols=4)
     counted = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
     lines = [f"{len(fits)} fits: {counted}; bars: one standard error"]
     if summary:
@@ -101,94 +111,45 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     return axes
 
 
-def _offset(series: int, count: int) -> float:
-    """Place of a series beside its group."""
-    return (series + 0.5) * 0.8 / count - 0.4
-
-
-def _side_by_side(place: np.ndarray, labels: np.ndarray, series: Sequence[str]) -> np.ndarray:
-    """Horizontal position of each fit: series side by side, trials spread out."""
-    width = 0.8 / len(series)
-    x = place.astype(float)
-    for i, label in enumerate(series):
-        for group in range(place.max() + 1):
-            rows = np.flatnonzero((labels == label) & (place == group))
-            fan = np.linspace(-0.35, 0.35, rows.size) if rows.size > 1 else np.zeros(rows.size)
-            x[rows] += _offset(i, len(series)) + fan * width
-    return x
-
-
-def _points(
-    axis: Axes,
-    x: np.ndarray,
-    values: np.ndarray,
-    errors: np.ndarray,
-    rows: np.ndarray,
-    series: int,
-    label: str,
-    *,
-    hollow: bool,
-) -> None:
-    if not rows.any():
-        return
-    error = np.where(np.isfinite(errors[rows]), errors[rows], 0.0)
-    colour = COLOURS[series % len(COLOURS)]
-    axis.errorbar(
-        x[rows], values[rows], error, fmt=MARKS[series % len(MARKS)], ms=4, lw=0.8, color=colour,
-        markerfacecolor="white" if hollow else colour, label=label,
-    )  # fmt: skip
-
-
-def _legend(axis: Axes, series: Sequence[str], hollow: str, *, beside: bool = False) -> None:
+def _legend(axis: Axes, series: Sequence[str], hollow: str, **place: Any) -> None:
     """A legend with one entry per series, and one entry that explains hollow points."""
-    handles = [
-        Line2D([], [], ls="", marker=MARKS[i % len(MARKS)], ms=4, color=COLOURS[i % len(COLOURS)],
-               label=name)
-        for i, name in enumerate(series) if name
-    ]  # fmt: skip
+    entries = [key(name, nth(MARKS, i), nth(COLOURS, i)) for i, name in enumerate(series) if name]
     if hollow:
-        handles.append(
-            Line2D([], [], ls="", marker="o", ms=4, color=INK, mfc="white", label=hollow)
-        )
-    if handles:
-        place = {"loc": "upper left", "bbox_to_anchor": (1, 1)} if beside else {"ncols": 4}
-        axis.legend(handles=handles, frameon=False, fontsize=8, **place)
+        entries.append(key(hollow, "o", hollow=True))
+    if entries:
+        axis.legend(handles=entries, **place)
 
 
 def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
     """Smallest relative standard errors by recording; undetermined elements are hollow."""
-    height = 1.3 + 0.22 * len(bounds)
-    (axis,) = axes = canvas(1, 1, (7.5, height)).ravel()
+    (axis,) = axes = canvas(1, 1, (7.5, 1.3 + 0.22 * len(bounds))).ravel()
     names = list(dict.fromkeys(name for one in bounds for name in one.circuit.names()))
     known = [e for one in bounds for e in one.relative.values() if np.isfinite(e)]
     edge = 100 * max([1.0, *known])  # place of bounds that are not finite
-    undetermined = []
     for i, name in enumerate(names):
-        of = [(row, one) for row, one in enumerate(bounds) if name in one.relative]
         offset = 0.5 * ((i + 0.5) / len(names) - 0.5)  # so that equal errors do not overlap
-        place = np.array([row + offset for row, _ in of])
-        error = 100 * np.array([one.relative[name] for _, one in of])
-        hollow = np.array([name in one.undetermined for _, one in of])
-        colour, mark = COLOURS[i % len(COLOURS)], MARKS[i % len(MARKS)]
-        for part, face in ((~hollow, colour), (hollow, "white")):
-            at = np.where(np.isfinite(error), error, edge)[part]
-            axis.plot(at, place[part], mark, ms=4.5, color=colour, mfc=face)
-        undetermined += [one.path for (_, one), is_hollow in zip(of, hollow, strict=True)
-                         if is_hollow]  # fmt: skip
+        for row, one in enumerate(bounds):
+            if name in one.relative:
+                error, hollow = 100 * one.relative[name], name in one.undetermined
+                axis.plot(
+                    error if np.isfinite(error) else edge, row + offset, nth(MARKS, i), ms=4.5,
+                    color=nth(COLOURS, i), mfc="white" if hollow else nth(COLOURS, i),
+                )  # fmt: skip
     axis.set_xscale("log")
-    if undetermined:
-        axis.axvline(100, color=RED, lw=0.9, ls="--")  # see `Bound.undetermined`
-    plain_ticks(axis.xaxis)
-    axis.set_xlabel("smallest relative standard error [%]")
-    axis.set_yticks(range(len(bounds)), [one.path or "-" for one in bounds])
-    axis.set_ylim(len(bounds) - 0.5, -0.5)
-    _legend(axis, names, "undetermined" if undetermined else "", beside=True)
+    undetermined = {one.path for one in bounds if one.undetermined}
     lines = []
     if undetermined:
+        axis.axvline(100, color=RED, lw=0.9, ls="--")  # see `Bound.undetermined`
         lines.append(
-            f"{len(set(undetermined))} of {len(bounds)} recordings leave an element undetermined "
+            f"{len(undetermined)} of {len(bounds)} recordings leave an element undetermined "
             "(100 % or more)"
         )
+    plain_ticks(axis.xaxis)
+    axis.set_xlabel("smallest relative standard error [%]")
+    axis.set_yticks(range(len(bounds)), [plain(one.path) or "-" for one in bounds])
+    axis.set_ylim(len(bounds) - 0.5, -0.5)
+    beside = {"loc": "upper left", "bbox_to_anchor": (1, 1)}
+    _legend(axis, names, "undetermined" if undetermined else "", **beside)
     titled(axis, lines, good=not undetermined)
     return axes
 
@@ -199,70 +160,48 @@ def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
     count = len(units)
     grid = canvas(count, count, (2.4 * count + 0.6, 2.2 * count + 0.4))
     scales = np.array([DISPLAY[unit][0] for unit in units.values()])
-    draws = (
-        np.stack([np.asarray(getattr(posterior.draws, name)) for name in units]) / scales[:, None]
-    )
+    labels = [symbol(name, unit) for name, unit in units.items()]
+    draws = np.asarray(posterior.draws.values()).T / scales[:, None]
     centre = np.asarray(posterior.circuit.values()) / scales
     cov = posterior.cov / np.outer(scales, scales)
+    ends = np.array(list(posterior.intervals(LEVEL).values())) / scales[:, None]
     random = np.random.default_rng(0)
     some = random.choice(posterior.weights.size, 2000, p=posterior.weights)
-    ranges = [_range(values[some]) for values in draws]
-    intervals = list(posterior.intervals(LEVEL).values())
-    for row, (name, unit) in enumerate(units.items()):
+    low, high = np.quantile(draws[:, some], [0.002, 0.998], axis=1)
+    low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
+    for row in range(count):
         for column in range(count):
             axis = grid[row, column]
             if column > row:
                 axis.set_visible(False)
                 continue
-            axis.set_xlim(ranges[column])
+            axis.set_xlim(low[column], high[column])
             axis.locator_params(axis="x", nbins=4)
             if column == row:
-                ends = np.array(intervals[row]) / scales[row]
-                _histogram(axis, draws[row], posterior.weights, ends, centre[row], cov[row, row])
+                bins = np.linspace(low[row], high[row], 30).tolist()
+                look = {"density": True, "color": BLUE, "alpha": 0.7}
+                axis.hist(draws[row], bins=bins, weights=posterior.weights, **look)
+                x = np.linspace(low[row], high[row], 200)
+                normal = statistics.NormalDist(centre[row], np.sqrt(cov[row, row]))
+                axis.plot(x, [normal.pdf(one) for one in x], color=RED, lw=1.2)
+                axis.axvspan(*ends[row], color="0.85", lw=0, zorder=0)
+                axis.set_yticks([])
             else:
                 axis.plot(draws[column][some], draws[row][some], ".", ms=1.5, color=BLUE, alpha=0.4)
                 pick = np.ix_([column, row], [column, row])
                 axis.plot(*_ellipse(centre[[column, row]], cov[pick]), color=RED, lw=1.2)
-                axis.set_ylim(ranges[row])
+                axis.set_ylim(low[row], high[row])
                 axis.locator_params(axis="y", nbins=5)
-                if column == 0:
-                    axis.set_ylabel(symbol(name, unit))
+            if 0 == column < row:
+                axis.set_ylabel(labels[row])
+            axis.tick_params(labelbottom=row == count - 1, labelleft=column == 0)
             if row == count - 1:
-                axis.set_xlabel(symbol(list(units)[column], list(units.values())[column]))
-            else:
-                axis.tick_params(labelbottom=False)
-            if 0 < column < row:
-                axis.tick_params(labelleft=False)
+                axis.set_xlabel(labels[column])
     grid[0, 0].plot([], [], color=RED, lw=1.2, label="fit ± standard error")
-    place = {"loc": "upper left", "bbox_to_anchor": (1.02, 1)}
-    grid[0, 0].legend(frameon=False, fontsize=8, **place).set_in_layout(False)
+    grid[0, 0].legend(loc="upper left", bbox_to_anchor=(1.02, 1)).set_in_layout(False)
     title = f"{posterior.weights.size} draws, worth {posterior.effective:.0f}; shaded: 95 %"
     titled(grid[0, 0], [title])
     return grid.ravel()
-
-
-def _range(values: Float[np.ndarray, " draw"]) -> tuple[float, float]:
-    low, high = np.quantile(values, [0.002, 0.998])
-    return low - 0.05 * (high - low), high + 0.05 * (high - low)
-
-
-def _histogram(
-    axis: Axes,
-    values: Float[np.ndarray, " draw"],
-    weights: Float[np.ndarray, " draw"],
-    ends: Float[np.ndarray, " end"],
-    centre: float,
-    variance: float,
-) -> None:
-    """The histogram of one element, its interval, and the normal distribution of the fit."""
-    low, high = axis.get_xlim()
-    bins = np.linspace(low, high, 30).tolist()
-    axis.hist(values, bins=bins, weights=weights, density=True, color=BLUE, alpha=0.7)
-    x = np.linspace(low, high, 200)
-    normal = np.exp(-((x - centre) ** 2) / (2 * variance)) / np.sqrt(2 * np.pi * variance)
-    axis.plot(x, normal, color=RED, lw=1.2)
-    axis.axvspan(*ends, color="0.85", lw=0, zorder=0)
-    axis.set_yticks([])
 
 
 def _ellipse(
@@ -277,17 +216,16 @@ def _ellipse(
 
 def draw_profile(canvas: Canvas, profile: Profile) -> np.ndarray:
     """The deviance over the values of an element, and the parabola of the standard error."""
-    axes = canvas(1, 1, (5.2, 3.6)).ravel()
-    axis = axes[0]
+    (axis,) = axes = canvas(1, 1, (5.2, 3.6)).ravel()
     scale = DISPLAY[profile.unit][0]
     values = profile.values / scale
-    z = statistics.NormalDist().inv_cdf((1 + LEVEL) / 2)
+    limit = statistics.NormalDist().inv_cdf((1 + LEVEL) / 2) ** 2
     axis.plot(values, profile.deviance, color=BLUE, lw=1.5, label="other parameters fitted again")
     parabola = ((profile.values - profile.value) / profile.stderr) ** 2
     axis.plot(values, parabola, "--", color=RED, lw=1.2, label="fit ± standard error")
-    axis.axhline(z**2, color=INK, lw=0.8, ls=":")
+    axis.axhline(limit, color=INK, lw=0.8, ls=":")
     axis.annotate(
-        "95 %", (1, z**2), xycoords=("axes fraction", "data"), xytext=(-2, 2),
+        "95 %", (1, limit), xycoords=("axes fraction", "data"), xytext=(-2, 2),
         textcoords="offset points", ha="right", va="bottom", fontsize=8,
     )  # fmt: skip
     low, high = np.clip(np.array(profile.interval(LEVEL)) / scale, values[0], values[-1])
@@ -296,5 +234,5 @@ def draw_profile(canvas: Canvas, profile: Profile) -> np.ndarray:
         xlabel=symbol(profile.name, profile.unit), ylabel="deviance", ylim=(0.0, 10.0),
         xlim=(values[0], values[-1]),
     )  # fmt: skip
-    axis.legend(frameon=False, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+    axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     return axes

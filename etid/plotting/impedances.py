@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.numpy_tier.tiers import program
-from etid.plotting.style import COLOURS, DASHES, Canvas, plain_ticks, titled, typeset
-from etid.results.driver import Driver, SourceImpedance
+from etid.plotting import Impedance
+from etid.plotting.style import COLOURS, DASHES, Canvas, nth, plain_ticks, titled, typeset
+from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.solvers.matrices import log_stderr
 
@@ -19,44 +20,32 @@ LOWEST, HIGHEST = 60.0, 100e3  # [Hz] the paper's pulse rate and half its sample
 POINTS = 300
 
 
-def draw_bode(
-    canvas: Canvas, things: Mapping[str, Driver | Fit | AbstractCircuit | SourceImpedance]
-) -> np.ndarray:
+def draw_bode(canvas: Canvas, things: Mapping[str, Impedance]) -> np.ndarray:
     """Magnitude and phase of impedances (the paper's figure 9), with bands."""
     magnitude, phase = axes = canvas(2, 1, (6.0, 5.0), sharex=True).ravel()
     frequency = jax.device_put(np.geomspace(LOWEST, HIGHEST, POINTS))
     kilohertz = np.asarray(frequency) / 1e3
     sizes, banded, failed = [], False, []
     for i, (label, thing) in enumerate(things.items()):
-        z = np.asarray(impedance(thing).response(frequency))
-        errors = np.asarray(stderr(thing, frequency))
-        known = bool(np.isfinite(errors).all())
+        z, errors = map(np.asarray, _with_errors(thing, frequency))
+        known = np.isfinite(errors).all()
         if isinstance(thing, Fit | Driver):
             if thing.verdict != "successful":
                 failed.append(f"{label}: no success: {thing.verdict}")
             label = label if known else f"{label}, no standard error"
-        colour, dash = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]
-        curve(
-            magnitude,
-            phase,
-            frequency,
-            z,
-            label=typeset(label),
-            color=colour,
-            linestyle=dash,
-            lw=1.3,
-        )
+        look = {"color": nth(COLOURS, i), "linestyle": nth(DASHES, i), "lw": 1.3}
+        curve(magnitude, phase, frequency, z, label=typeset(label), **look)
         sizes.append(np.abs(z) / 1e3)
         if known:
             banded = True
-            band = {"color": colour, "alpha": 0.25, "linewidth": 0}
+            band = {"color": nth(COLOURS, i), "alpha": 0.25, "linewidth": 0}
             factor = np.exp(np.minimum(2 * errors[0], 50))  # it is finite beyond every axis
             magnitude.fill_between(kilohertz, sizes[-1] / factor, sizes[-1] * factor, **band)
             angle, turn = np.unwrap(np.angle(z)), 2 * errors[1]
             phase.fill_between(kilohertz, *np.degrees([angle - turn, angle + turn]), **band)
     phase.set(xlabel="frequency [kHz]")
     frame(magnitude, phase, np.concatenate(sizes))
-    magnitude.legend(frameon=False, fontsize=8)
+    magnitude.legend()
     titled(magnitude, failed or ["bands: two standard errors" if banded else ""], good=not failed)
     return axes
 
@@ -105,27 +94,16 @@ def frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> N
     phase.xaxis.set_major_formatter("{x:g}")
 
 
-def impedance(
-    thing: Driver | Fit | AbstractCircuit | SourceImpedance,
-) -> Driver | AbstractCircuit | SourceImpedance:
-    """The object with an impedance: the circuit of a fit, otherwise `thing` itself."""
-    if not isinstance(thing, Fit):
-        return thing
-    if np.ndim(thing.rrse):
-        raise TypeError(f"this is a batch of {np.shape(thing.rrse)} fits; draw one fit, fits[i]")
-    return thing.circuit
-
-
-def stderr(
-    thing: Driver | Fit | AbstractCircuit | SourceImpedance,
-    frequency: Float[Array, " frequency"],
-) -> Float[Array | np.ndarray, "2 frequency"]:
-    """Standard errors of ln |Z| and of the phase [rad]; NaN where there is no covariance."""
-    if isinstance(thing, Driver):
-        return thing.log_response_stderr(frequency)
+def _with_errors(
+    thing: Impedance, frequency: Float[Array, " frequency"]
+) -> tuple[Complex[Array, " frequency"], Float[Array | np.ndarray, "2 frequency"]]:
+    """Z, and standard errors of ln |Z| and of the phase [rad]; NaN without a covariance."""
     if isinstance(thing, Fit):
-        return _of_circuit(thing.circuit, jax.device_put(thing.cov), frequency)
-    return np.full((2, frequency.size), np.nan)
+        errors = _of_circuit(thing.circuit, jax.device_put(thing.cov), frequency)
+        return thing.circuit.response(frequency), errors
+    if isinstance(thing, Driver):
+        return thing.response(frequency), thing.log_response_stderr(frequency)
+    return thing.response(frequency), np.full((2, frequency.size), np.nan)
 
 
 @program
@@ -134,7 +112,7 @@ def _of_circuit(
     cov: Float[Array, "parameter parameter"],
     frequency: Float[Array, " frequency"],
 ) -> Float[Array, "2 frequency"]:
-    """`stderr` of a circuit with the covariance of its parameters."""
+    """Standard errors of ln |Z| and of the phase, from the covariance of the elements."""
     kind, names = type(circuit), circuit.names()
 
     def response(values: Float[Array, " parameter"]) -> Complex[Array, " frequency"]:

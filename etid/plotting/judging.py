@@ -15,8 +15,19 @@ from etid.identify.arguments import fed
 from etid.identify.predict import predict
 from etid.plotting.bands import CLEAR, Bands, bands
 from etid.plotting.impedances import POINTS, curve, frame, points
-from etid.plotting.pulses import headline
-from etid.plotting.style import BLUE, COLOURS, DASHES, INK, MARKS, RED, Canvas, titled, typeset
+from etid.plotting.style import (
+    BLUE,
+    COLOURS,
+    DASHES,
+    INK,
+    MARKS,
+    RED,
+    Canvas,
+    judged,
+    nth,
+    titled,
+    typeset,
+)
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -35,19 +46,19 @@ def draw_impedance(
     measured = bands(Harmonics.of(Inspected(recording)), known, fit.circuit)
     clear = measured.stderr <= CLEAR
     points = measured.frequency[clear], measured.z[clear], measured.stderr[clear]
-    return _diagrams(canvas, fit, headline(recording.path, fit), *points)
+    return _diagrams(canvas, fit, recording.path, *points)
 
 
 def draw_measured(canvas: Canvas, fit: Fit, measured: MeasuredImpedance) -> np.ndarray:
     """Nyquist and Bode diagrams: the impedance that an instrument measured, and the fit."""
     error = None if measured.stderr is None else measured.stderr / np.abs(measured.z)
-    return _diagrams(canvas, fit, headline("", fit), measured.frequency, measured.z, error)
+    return _diagrams(canvas, fit, "", measured.frequency, measured.z, error)
 
 
 def _diagrams(
     canvas: Canvas,
     fit: Fit,
-    title: str,
+    path: str,
     frequency: Float[np.ndarray, " point"],
     z: Complex[np.ndarray, " point"],
     stderr: Float[np.ndarray, " point"] | None,
@@ -70,10 +81,9 @@ def _diagrams(
     for axis in (magnitude, phase):
         axis.set(xlabel="frequency [kHz]")
     magnitude.xaxis.set_major_formatter("{x:g}")
-    magnitude.legend(frameon=False, fontsize=8)
-    good = fit.verdict == "successful"
-    titled(nyquist, [title], good=good)
-    titled(magnitude, [",  ".join(fit.elements)], good=good)
+    magnitude.legend()
+    judged(nyquist, path, fit)
+    titled(magnitude, [",  ".join(fit.elements)], good=fit.verdict == "successful")
     return axes
 
 
@@ -109,7 +119,7 @@ def draw_residual(
     _correlation(own, clean, clean, "autocorrelation of the residual")
     name = typeset("V_th") if cause == "v_th" else "current"
     _correlation(with_input, clean, cause_known, f"correlation with earlier {name}")
-    titled(whole, [headline(recording.path, fit)], good=fit.verdict == "successful")
+    judged(whole, recording.path, fit)
     titled(own, ["band: 99 % of white noise"])
     return axes
 
@@ -142,16 +152,10 @@ def draw_selection(
     ratios = {"height_ratios": [3, 1.6]}
     axes = canvas(2, 2, (9.0, 5.2), sharex=True, gridspec_kw=ratios).ravel()
     chosen = selection.candidates[0]
-    good = chosen.fit.verdict == "successful"
-    lines = [
-        headline(recording.path, selection.fit),
-        chosen.name,
-        ",  ".join(selection.fit.elements),
-    ]
-    fitted = [one for one in selection.candidates if _has_elements(one)]
-    if not fitted or fitted[0] is not chosen:
+    fitted = [one for one in selection.candidates if np.isfinite(one.fit.circuit.values()).all()]
+    if chosen not in fitted:
         axes[0].text(0.5, 0.5, "no elements", color=RED, transform=axes[0].transAxes, ha="center")
-        titled(axes[0], lines[:1], good=False)
+        judged(axes[0], recording.path, selection.fit)
         return axes
     recording, known = _in_bands(recording, driver)
     lane = Harmonics.of(Inspected(recording))
@@ -161,20 +165,17 @@ def draw_selection(
     found = [bands(lane, known, one.fit.circuit) for one in fitted]
     _measured_and_fitted(axes[0], axes[1], fitted, found[0])
     _deviations(axes[2], axes[3], found)
-    titled(axes[0], lines, good=good)
+    elements = ",  ".join(selection.fit.elements)
+    judged(axes[0], recording.path, selection.fit, chosen.name, elements)
     return axes
-
-
-def _has_elements(candidate: Candidate) -> bool:
-    return bool(np.isfinite(np.asarray(candidate.fit.circuit.values())).all())
 
 
 def _look(number: int) -> dict[str, Any]:
     """Look of a candidate; the first one is the chosen one."""
-    colour, dash = COLOURS[number % len(COLOURS)], DASHES[number % len(DASHES)]
     # The bold line lies below the others, which it would hide.
     width, layer = (1.1, 2.5) if number else (2.2, 2.2)
-    return {"color": colour, "linestyle": dash, "lw": width, "zorder": layer}
+    line = {"color": nth(COLOURS, number), "linestyle": nth(DASHES, number)}
+    return line | {"lw": width, "zorder": layer}
 
 
 def _measured_and_fitted(
@@ -182,26 +183,25 @@ def _measured_and_fitted(
 ) -> None:
     """The measured impedance, pale where it is uncertain, and those of the candidates."""
     clear = measured.stderr <= CLEAR
-    for some, alpha in ((clear, 1.0), (~clear & (measured.stderr <= 1.0), 0.3)):
-        look: Any = {"color": INK, "ms": 3.5, "lw": 0.9, "capsize": 2.0, "alpha": alpha}
-        label = "measured" if alpha == 1.0 else None
+    look: Any = {"color": INK, "ms": 3.5, "lw": 0.9, "capsize": 2.0}
+    for some, label, alpha in (
+        (clear, "measured", 1.0),
+        (~clear & (measured.stderr <= 1.0), None, 0.3),
+    ):
         of = measured.frequency[some], measured.z[some], measured.stderr[some]
-        points(magnitude, phase, *of, label=label, **look)
+        points(magnitude, phase, *of, label=label, alpha=alpha, **look)
     frequency = jnp.geomspace(measured.frequency[0], measured.frequency[-1], POINTS)
     sizes = [np.abs(measured.z[clear]) / 1e3]
     for number, one in enumerate(fitted):
+        label = f"{one.name}, chosen"
+        if number:
+            verdict = "" if one.fit.verdict == "successful" else f", {one.fit.verdict}"
+            label = f"{one.name}, 2 log evidence {one.evidence:+.0f}{verdict}"
         z = np.asarray(one.fit.circuit.response(frequency))
         sizes.append(np.abs(z) / 1e3)
-        curve(magnitude, phase, frequency, z, label=_label(number, one), **_look(number))
+        curve(magnitude, phase, frequency, z, label=label, **_look(number))
     frame(magnitude, phase, np.concatenate(sizes))
-    magnitude.legend(frameon=False, fontsize=8, loc="lower left")
-
-
-def _label(number: int, one: Candidate) -> str:
-    if number == 0:
-        return f"{one.name}, chosen"
-    verdict = "" if one.fit.verdict == "successful" else f", {one.fit.verdict}"
-    return f"{one.name}, 2 log evidence {one.evidence:+.0f}{verdict}"
+    magnitude.legend(loc="lower left")
 
 
 def _deviations(magnitude: Axes, phase: Axes, found: list[Bands]) -> None:
@@ -212,8 +212,8 @@ def _deviations(magnitude: Axes, phase: Axes, found: list[Bands]) -> None:
         axis.axhspan(-2.0, 2.0, color="0.85", lw=0)
         axis.axhline(0.0, color="0.6", lw=0.6)
         for number, of in enumerate(found):
-            mark = {"marker": MARKS[number % len(MARKS)], "ms": 3.0}
-            axis.plot(of.frequency / 1e3, of.deviation[part], **_look(number), **mark)
+            look = _look(number) | {"marker": nth(MARKS, number), "ms": 3.0}
+            axis.plot(of.frequency / 1e3, of.deviation[part], **look)
         axis.set(xlabel="frequency [kHz]", ylabel=f"measured - fitted\n{name} [stderr]")
         axis.set_yscale("symlog", linthresh=plain, linscale=1.0)
         ticks = [tick for tick in (2.0, 10.0, 100.0, 1000.0, 10000.0) if tick <= largest]

@@ -5,11 +5,21 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import LogNorm
-from matplotlib.lines import Line2D
 
 from etid.circuits.display import DISPLAY
 from etid.plotting.layout import Layout
-from etid.plotting.style import INK, MARKS, Canvas, drawable, plain_ticks, symbol, titled
+from etid.plotting.style import (
+    INK,
+    MARKS,
+    Canvas,
+    drawable,
+    key,
+    nth,
+    plain,
+    plain_ticks,
+    symbol,
+    titled,
+)
 from etid.results.fits import Fits
 
 COLOURS = "cividis"  # readers with and without red-green blindness see it alike
@@ -25,13 +35,11 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     all maps. An electrode without a successful trial has a mark of its own for each verdict.
 
     Raises:
-        ValueError: There is no such element, there are no fits, or an electrode has no place.
+        ValueError: There is no such element, or an electrode has no place.
     """
     units = fits.circuit.units()
     if element not in units:
         raise ValueError(f"map is {element!r}, must be one of {', '.join(map(repr, units))}")
-    if not len(fits):
-        raise ValueError("there are no fits to draw")
     place = layout.place(fits.labels["electrode"])
     keys = groups_of(fits)
     groups = sorted(set(keys))
@@ -39,7 +47,7 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     good = (fits.verdicts == "successful") & drawable(values)
     norm = LogNorm(*(_round(values[good]) if good.any() else (1.0, 10.0)))
     bad = sorted({str(verdict) for verdict in fits.verdicts[~good]} - {"successful"})
-    marks: dict[str, str] = dict(zip(bad, (*MARKS[1:], *MARKS[1:]), strict=False))
+    marks = {verdict: nth(MARKS[1:], number) for number, verdict in enumerate(bad)}
     columns = min(ROW, len(groups))
     rows = -(-len(groups) // columns)
     width, height = np.ptp(layout.x), np.ptp(layout.y)
@@ -47,12 +55,17 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     size = (2.0 * columns + 1.4, (tall + 0.9) * rows + 0.4)
     axes = canvas(rows, columns, size, sharex=True, sharey=True)
     for axis, group in zip(axes.flat, groups, strict=False):
-        chosen = np.array([key == group for key in keys])
-        _electrodes(axis, layout, place[chosen], values[chosen], good[chosen], norm)
-        _failed(axis, layout, place[chosen], fits.verdicts[chosen], good[chosen], marks)
-        names = [name for name in group if name]
-        count = len({*place[chosen & good]})
-        titled(axis, [", ".join(names), f"{count} of {len({*place[chosen]})} electrodes"])
+        of = np.array([one == group for one in keys])
+        shown = np.unique(place[of & good])
+        failed = np.setdiff1d(place[of], shown)
+        medians = np.array([np.median(values[of & good & (place == one)]) for one in shown])
+        _electrodes(axis, layout, shown, medians, norm)
+        for one in failed:
+            verdict = str(fits.verdicts[of & (place == one)][0])
+            at, mark = (1e3 * layout.x[one], 1e3 * layout.y[one]), marks.get(verdict, "x")
+            axis.plot(*at, mark, ms=6, color=INK, mfc="white")
+        count = f"{shown.size} of {shown.size + failed.size} electrodes"
+        titled(axis, [plain(", ".join(filter(None, group))), count])
     for axis in axes.flat[len(groups) :]:
         axis.set_axis_off()
     for axis in axes[-1]:
@@ -64,13 +77,9 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     bar.set_label(symbol(element, units[element]))
     plain_ticks(bar.ax.yaxis)
     if marks:
-        handles = [
-            Line2D([], [], ls="", marker=mark, ms=6, color=INK, mfc="white", label=name)
-            for name, mark in marks.items()
-        ]
-        figure.legend(
-            handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8
-        )
+        handles = [key(name, mark, hollow=True) for name, mark in marks.items()]
+        place = {"loc": "outside lower center", "ncols": 4}
+        figure.legend(handles=handles, markerscale=1.5, **place)
     return axes.ravel()
 
 
@@ -86,14 +95,9 @@ def _round(values: np.ndarray) -> tuple[float, float]:
 
 
 def _electrodes(
-    axis: Axes,
-    layout: Layout,
-    place: np.ndarray,
-    values: np.ndarray,
-    good: np.ndarray,
-    norm: LogNorm,
+    axis: Axes, layout: Layout, shown: np.ndarray, values: np.ndarray, norm: LogNorm
 ) -> None:
-    """Draw electrodes with a value; places that were not recorded are dots."""
+    """Draw the electrodes with a value; all other places are small dots."""
     x, y = 1e3 * layout.x, 1e3 * layout.y
     apart = np.hypot(x[:, None] - x, y[:, None] - y)
     pitch = np.min(apart + np.where(apart > 0, 0.0, np.inf), initial=10.0)
@@ -101,28 +105,9 @@ def _electrodes(
     axis.set_aspect("equal")
     axis.grid(False)
     axis.plot(x, y, ".", ms=2, color="0.75", zorder=1)
-    shown = np.unique(place[good])
-    medians = np.array([np.median(values[good & (place == one)]) for one in shown])
     dots = EllipseCollection(
-        [DOT * pitch], [DOT * pitch], [0.0], units="x", cmap=COLOURS, norm=norm, array=medians,
+        [DOT * pitch], [DOT * pitch], [0.0], units="x", cmap=COLOURS, norm=norm, array=values,
         offsets=np.column_stack([x[shown], y[shown]]), offset_transform=axis.transData,
         zorder=2,
     )  # fmt: skip
     axis.add_collection(dots)
-
-
-def _failed(
-    axis: Axes,
-    layout: Layout,
-    place: np.ndarray,
-    verdicts: np.ndarray,
-    good: np.ndarray,
-    marks: dict[str, str],
-) -> None:
-    """Mark the electrodes without a successful trial by the verdict of their first one."""
-    for one in np.setdiff1d(place, place[good]):
-        verdict = str(verdicts[place == one][0])
-        axis.plot(
-            1e3 * layout.x[one], 1e3 * layout.y[one], marks.get(verdict, "x"), ms=6, color=INK,
-            mfc="white",
-        )  # fmt: skip

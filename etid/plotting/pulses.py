@@ -2,13 +2,12 @@
 
 import jax
 import numpy as np
-from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.circuits.display import heading, scaled
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
-from etid.plotting.style import BLUE, INK, RED, Canvas, titled, typeset
+from etid.plotting.style import BLUE, INK, RED, Canvas, judged, plain, titled, typeset
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
@@ -58,27 +57,17 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
     labels = [f"{name} {value}" for name in LABELS if (value := getattr(recording, name))]
     if recording.r_load is not None:
         labels.append(f"calibration with {recording.r_load / 1e3:g} kΩ")
-    titled(axes[0, 0], [recording.path, ", ".join(labels)])
+    titled(axes[0, 0], [plain(recording.path), plain(", ".join(labels))])
     titled(axes[0, 1], ["one pulse"])
-    axes[0, 1].legend(frameon=False)
+    axes[0, 1].legend(fontsize="medium")
     return axes.ravel()
 
 
 def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None) -> np.ndarray:
     """Measured and predicted pulse, the residual, and the verdict of the fit as title."""
-    if np.ndim(fit.rrse):
-        raise TypeError(
-            f"this is a batch of {np.shape(fit.rrse)} fits; draw one fit, fits[i], or all of "
-            "them, plot(fits)"
-        )
-    axes = _pulse_and_residual(canvas)
-    good = fit.verdict == "successful"
-    if not np.isfinite(np.asarray(fit.circuit.values())).all():
-        _unpredicted(axes[0], axes[1], recording)
-        titled(axes[0], [headline(recording.path, fit)], good=good)
-        return axes
-    draw_pulse(axes[0], axes[1], recording, driver, fit.circuit)
-    titled(axes[0], [headline(recording.path, fit), ",  ".join(fit.elements)], good=good)
+    known = np.isfinite(np.asarray(fit.circuit.values())).all()
+    axes = _pulse_and_residual(canvas, recording, driver, fit.circuit if known else None)
+    judged(axes[0], recording.path, fit, ",  ".join(fit.elements) if known else "")
     return axes
 
 
@@ -89,82 +78,48 @@ def draw_calibration(canvas: Canvas, driver: Driver, recording: Recording) -> np
             "a driver is drawn with a calibration, but this recording has no r_load; draw the "
             "fit of this recording, plot(fit, recording, driver)"
         )
-    axes = _pulse_and_residual(canvas)
-    draw_pulse(axes[0], axes[1], recording, driver, Resistor(recording.r_load))
-    lines = [headline(recording.path, driver), f"driver of order {driver.order}, "]
-    lines[1] += f"known load {recording.r_load / 1e3:g} kΩ"
-    titled(axes[0], lines, good=driver.verdict == "successful")
+    axes = _pulse_and_residual(canvas, recording, driver, Resistor(recording.r_load))
+    about = f"driver of order {driver.order}, known load {recording.r_load / 1e3:g} kΩ"
+    judged(axes[0], recording.path, driver, about)
     return axes
 
 
-def _pulse_and_residual(canvas: Canvas) -> np.ndarray:
-    ratios = {"height_ratios": [3, 1.2]}
-    return canvas(2, 1, (6.0, 4.8), sharex=True, gridspec_kw=ratios).ravel()
+def _pulse_and_residual(
+    canvas: Canvas, recording: Recording, driver: Driver | None, load: AbstractCircuit | None
+) -> np.ndarray:
+    """One pulse, measured and predicted, and the residual with ±2σ of the noise.
 
-
-def headline(path: str, found: Fit | Driver) -> str:
-    """Path of the recording if it has one, verdict, χ² and RRSE, for a title."""
-    verdict = found.verdict
-    verdict = verdict if verdict == "successful" else f"no success: {verdict}"
-    quality = f"chi2 {float(found.chi2):.3g}" if np.isfinite(float(found.chi2)) else ""
-    error = f"RRSE {100 * float(found.rrse):.3g} %" if np.isfinite(float(found.rrse)) else ""
-    where = f"{path}: " if path else ""
-    return where + ", ".join(filter(None, (verdict, quality, error)))
-
-
-def draw_pulse(
-    upper: Axes, lower: Axes, recording: Recording, driver: Driver | None, circuit: AbstractCircuit
-) -> None:
-    """Draw one pulse, measured and predicted, and the residual with ±2σ of the noise.
-
-    Args:
-        upper: Axes of the pulse.
-        lower: Axes of the residual.
-        recording: The measured voltages.
-        driver: Driver with a continuous source impedance; None for a measured current.
-        circuit: The load.
+    Without a load nothing is predicted.
     """
-    predicted = predict(recording, driver, circuit)
-    part = _measured(upper, recording)
-    milliseconds = 1e3 * recording.time[part]
-    upper.plot(milliseconds, predicted[part], "--", color=RED, lw=1.2, label="predicted")
-    upper.legend(frameon=False, fontsize=8)
-    sigma = 1e3 * residual_std(recording, driver, circuit)
-    residual = 1e3 * (predicted - recording.v_out)
-    # Above 0.4 of the sample rate, aliases of the edges are neither noise nor predicted.
-    label = r"$\pm2\,\sigma$ of the noise (edges: aliases)"
-    lower.axhspan(-2 * sigma, 2 * sigma, color="0.85", lw=0, label=label)
-    lower.axhline(0.0, color="0.6", lw=0.6)
-    lower.plot(milliseconds, residual[part], color=BLUE, lw=0.8)
-    lower.set(xlabel="time [ms]", ylabel="residual [mV]")
-    # Noise fills these axes, so the legend is above them.
-    lower.legend(
-        frameon=False, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0
-    )
-
-
-def _measured(upper: Axes, recording: Recording) -> slice:
+    ratios = {"height_ratios": [3, 1.2]}
+    upper, lower = axes = canvas(2, 1, (6.0, 4.8), sharex=True, gridspec_kw=ratios).ravel()
     part = pulse(recording)
-    milliseconds = 1e3 * recording.time[part]
+    time = 1e3 * recording.time[part]
     if recording.cause == "v_th":
-        upper.plot(
-            milliseconds, recording.v_th[part], ":", color="0.55", lw=1.0, label=typeset("V_th")
-        )
-    upper.plot(
-        milliseconds, recording.v_out[part], color=INK, lw=1.4, label=typeset("V_out measured")
-    )
+        upper.plot(time, recording.v_th[part], ":", color="0.55", lw=1.0, label=typeset("V_th"))
+    measured = typeset("V_out measured")
+    upper.plot(time, recording.v_out[part], color=INK, lw=1.4, label=measured)
     upper.set(ylabel="voltage [V]")
-    return part
-
-
-def _unpredicted(upper: Axes, lower: Axes, recording: Recording) -> None:
-    _measured(upper, recording)
-    upper.legend(frameon=False, fontsize=8)
-    lower.text(
-        0.5, 0.5, "no elements, nothing predicted", color=RED, transform=lower.transAxes,
-        ha="center", va="center",
-    )  # fmt: skip
-    lower.set(xlabel="time [ms]", ylabel="residual [mV]", yticks=[])
+    lower.set(xlabel="time [ms]", ylabel="residual [mV]")
+    if load is None:
+        lower.text(
+            0.5, 0.5, "no elements, nothing predicted", color=RED, transform=lower.transAxes,
+            ha="center", va="center",
+        )  # fmt: skip
+        lower.set(yticks=[])
+    else:
+        predicted = predict(recording, driver, load)
+        upper.plot(time, predicted[part], "--", color=RED, lw=1.2, label="predicted")
+        sigma = 1e3 * residual_std(recording, driver, load)
+        # Above 0.4 of the sample rate, aliases of the edges are neither noise nor predicted.
+        label = r"$\pm2\,\sigma$ of the noise (edges: aliases)"
+        lower.axhspan(-2 * sigma, 2 * sigma, color="0.85", lw=0, label=label)
+        lower.axhline(0.0, color="0.6", lw=0.6)
+        lower.plot(time, 1e3 * (predicted - recording.v_out)[part], color=BLUE, lw=0.8)
+        # Noise fills these axes, so the legend is above them.
+        lower.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
+    upper.legend()
+    return axes
 
 
 def residual_std(recording: Recording, driver: Driver | None, circuit: AbstractCircuit) -> float:

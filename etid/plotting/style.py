@@ -5,9 +5,11 @@ prints stay readable. The background is always white: a dark style of the reader
 curves on a dark background.
 """
 
+import io
 import os
 import pathlib
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,12 +17,15 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from etid.circuits.display import heading
 from etid.recordings.replacing import replacing
+from etid.results.driver import Driver
+from etid.results.fit import Fit
 
 INK = "#1a1a1a"
 BLUE = "#0b62a4"
@@ -36,7 +41,13 @@ PAPER: Any = {
     "text.color": INK,
     "xtick.color": INK,
     "ytick.color": INK,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
 }
+SVG: Any = {"svg.hashsalt": "etid"}
 
 # A letter with an index, or a time constant: no part of a path or of another word.
 _SYMBOL = re.compile(
@@ -49,59 +60,41 @@ Canvas = Callable[..., np.ndarray]
 
 
 def new_figure(
-    rows: int, columns: int, size: tuple[float, float], **options: Any
+    rows: int, columns: int, size: tuple[float, float], *, pyplot: bool = False, **options: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure outside of `matplotlib.pyplot`, with a light grid, and its axes [row, column].
+    """A figure with a light grid, and its axes [row, column].
 
     Args:
         rows: Number of rows of axes.
         columns: Number of columns of axes.
         size: Width and height [inch].
+        pyplot: Whether `matplotlib.pyplot` knows the figure, so that a notebook shows it.
         **options: Options of `Figure.subplots`.
     """
+    make: Callable[..., Figure] = Figure
+    if pyplot:
+        import matplotlib.pyplot as plt  # here, because it chooses a backend for the whole process
+
+        make = plt.figure
     with mpl.rc_context(PAPER):
-        figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasAgg(figure)
-        return figure, _subplots(figure, rows, columns, options)
+        figure = make(figsize=size, layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False, **options)
+        for axis in axes.flat:
+            # matplotlib makes ticks later, and would then use the reader's style.
+            axis.grid(True, color="0.9", linewidth=0.6)
+            axis.tick_params(which="both", colors=INK)
+    return figure, axes
 
 
-def on_pyplot(own: tuple[float, float] | None) -> Canvas:
-    """A canvas on a new figure, of its own size, that a notebook or `pyplot.show` shows."""
-    import matplotlib.pyplot as plt  # here, because it chooses a backend for the whole process
-
-    def canvas(rows: int, columns: int, size: tuple[float, float], **options: Any) -> np.ndarray:
-        with mpl.rc_context(PAPER):
-            figure = plt.figure(figsize=own or size, layout="constrained")
-            return _subplots(figure, rows, columns, options)
-
-    return canvas
+def nth(looks: Sequence[Any], number: int) -> Any:
+    """A colour, mark or dash for a series; after the last one they begin again."""
+    return looks[number % len(looks)]
 
 
-def on_axes(axes: Sequence[Axes] | np.ndarray) -> Canvas:
-    """A canvas on given axes, used in their order.
-
-    Raises:
-        ValueError: The picture needs another number of axes. The canvas raises it when it draws.
-    """
-    given = np.asarray(axes, dtype=object).ravel()
-
-    def canvas(rows: int, columns: int, size: tuple[float, float], **options: Any) -> np.ndarray:
-        if given.size != rows * columns:
-            raise ValueError(f"axes holds {given.size} Axes; this picture takes {rows * columns}")
-        return given.reshape(rows, columns)
-
-    return canvas
-
-
-def _subplots(figure: Figure, rows: int, columns: int, options: dict[str, Any]) -> np.ndarray:
-    axes = figure.subplots(rows, columns, squeeze=False, **options)
-    for axis in axes.flat:
-        axis.grid(True, color="0.9", linewidth=0.6)
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
-        # matplotlib makes ticks later, and would then use the reader's style.
-        axis.tick_params(which="both", colors=INK)
-    return axes
+def key(label: str, mark: str, colour: str = INK, *, hollow: bool = False) -> Line2D:
+    """An entry of a legend: a mark with its meaning."""
+    face = "white" if hollow else colour
+    return Line2D([], [], ls="", marker=mark, ms=4, color=colour, mfc=face, label=plain(label))
 
 
 def drawable(values: np.ndarray) -> np.ndarray:
@@ -138,6 +131,11 @@ def symbol(name: str, unit: str) -> str:
     return heading(f"${letter}{subscript}$", unit)
 
 
+def plain(text: str) -> str:
+    """A name from a file, in which matplotlib must see no formula: dollar signs are escaped."""
+    return text.replace("$", r"\$")
+
+
 def typeset(text: str) -> str:
     """A text with its symbols as formulas: `r_s 33.4 kΩ` begins with an R with the subscript s."""
     return _SYMBOL.sub(lambda found: symbol(found[0], "1"), text)
@@ -149,10 +147,41 @@ def titled(axis: Axes, lines: Sequence[str], *, good: bool = True) -> None:
     axis.set_title(typeset("\n".join(filter(None, lines))), loc="left", fontsize=9, color=color)
 
 
+def judged(axis: Axes, path: str, found: Fit | Driver, *more: str) -> None:
+    """Set a title of the path of the recording, the verdict, χ² and RRSE, and more lines."""
+    good = found.verdict == "successful"
+    words = [found.verdict if good else f"no success: {found.verdict}"]
+    if np.isfinite(chi2 := float(found.chi2)):
+        words.append(f"chi2 {chi2:.3g}")
+    if np.isfinite(rrse := float(found.rrse)):
+        words.append(f"RRSE {100 * rrse:.3g} %")
+    headline = ": ".join(filter(None, [plain(path), ", ".join(words)]))
+    titled(axis, [headline, *more], good=good)
+
+
+def svg(figure: Figure) -> bytes:
+    """A figure as SVG without dates and random names, so that equal figures give equal files."""
+    buffer, dpi = io.BytesIO(), figure.dpi
+    with mpl.rc_context(SVG), warnings.catch_warnings():
+        # Names in a foreign script stand in the tables, too.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        # `savefig` would draw a figure twice, the first time for its layout alone.
+        FigureCanvasSVG(figure)
+        if (layout := figure.get_layout_engine()) is not None:
+            layout.execute(figure)
+            figure.set_layout_engine("none")
+        figure.set_dpi(dpi)  # the layout was made with the dots of an SVG
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure as PNG or SVG without a date, so that equal figures give equal files."""
+    """Write a figure as PNG or SVG; equal figures give equal files."""
     suffix = pathlib.Path(path).suffix.lower()
     if suffix not in (".png", ".svg"):
         raise ValueError(f"{path}: use the suffix .png or .svg instead of {suffix or 'none'}")
     with replacing(path) as partial:
-        figure.savefig(partial, dpi=150, metadata={"Date": None} if suffix == ".svg" else {})
+        if suffix == ".svg":
+            pathlib.Path(partial).write_bytes(svg(figure))
+        else:
+            figure.savefig(partial, dpi=150)

@@ -5,18 +5,13 @@ for the same fits.
 """
 
 import dataclasses
-import io
-import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-import matplotlib
-import matplotlib.ticker
+import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from etid.circuits.display import DISPLAY
 from etid.plotting import figure_of
@@ -25,101 +20,83 @@ from etid.plotting.maps import BY, groups_of
 from etid.plotting.style import (
     COLOURS,
     DASHES,
+    INK,
     MARKS,
+    PAPER,
     drawable,
     new_figure,
+    plain,
     plain_ticks,
+    svg,
     symbol,
 )
 from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
 
-SVG: Any = {
-    "svg.hashsalt": "etid",
-    "figure.autolayout": False,
-    "figure.constrained_layout.use": False,
-}
 NARROW = 3.0  # ratio of the largest to the smallest value; above, an axis is logarithmic
 CROWD = 120  # largest number of subjects in a figure
 MAPS = 24  # largest number of maps of a display, for each element
 SERIES = 4  # largest number of conditions in a figure
 
 
-def svg(figure: Figure) -> bytes:
-    """A figure as SVG without dates and random names, so that equal figures give equal files."""
-    buffer, dpi = io.BytesIO(), figure.dpi
-    with matplotlib.rc_context(SVG), warnings.catch_warnings():
-        # The tables show the label as it is.
-        warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        # `savefig` would draw a figure twice, the first time for its layout alone.
-        FigureCanvasSVG(figure)
-        if (layout := figure.get_layout_engine()) is not None:
-            layout.execute(figure)
-            figure.set_layout_engine(None)
-        figure.set_dpi(dpi)  # the layout was made with the dots of an SVG
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
-
-
-def _drawable(values: np.ndarray) -> Float[np.ndarray, " value"]:
-    return np.asarray(values)[drawable(values)]
-
-
-def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
-    """Draw an empirical distribution function with at most 301 points."""
-    p = np.linspace(0.0, 1.0, min(300, values.size) + 1)
-    axis.step(
-        np.quantile(values, p, method="inverted_cdf"), 100 * p, ls=DASHES[series],
-        where="post", color=COLOURS[series], lw=1.3, label=label,
-    )  # fmt: skip
-
-
+@mpl.rc_context(PAPER)
 def distributions(fits: Fits) -> bytes:
     """Distribution functions of the successful fits, for each element and condition."""
     good, units = fits.successful(), fits.circuit.units()
     figure, axes = new_figure(1, len(units), (3.4 * len(units) + 1, 3.0), sharey=True)
     for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
-        scale = DISPLAY[unit][0]
         for series, condition in enumerate(frequent(fits, SERIES)):
-            values = _drawable(getattr(good.where(condition=condition).circuit, name)) / scale
+            values = _values(good.where(condition=condition), name, unit)
+            values = values[drawable(values)]
             if values.size:
-                _steps(axis, values, series, f"{_short(condition) or 'all'} ({values.size})")
+                p = np.linspace(0.0, 1.0, min(300, values.size) + 1)  # of 100 000 fits, too
+                axis.step(
+                    np.quantile(values, p, method="inverted_cdf"), 100 * p, ls=DASHES[series],
+                    where="post", color=COLOURS[series], lw=1.3,
+                    label=f"{plain(_short(condition)) or 'all'} ({values.size})",
+                )  # fmt: skip
         axis.set(xlabel=symbol(name, unit))
-        low, high = axis.dataLim.intervalx
-        if 0 < NARROW * low < high:
-            axis.set_xscale("log")
-            plain_ticks(axis.xaxis)
-        else:
-            axis.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(5))
+        axis.xaxis.set_major_locator(MaxNLocator(5))
+        _widen(axis, *axis.dataLim.intervalx)
     axes[0, 0].set_ylabel("fits below [%]")
     if axes[0, 0].lines:
-        axes[0, 0].legend(frameon=False, fontsize=8)
+        axes[0, 0].legend()
     return svg(figure)
+
+
+def _values(fits: Fits, name: str, unit: str) -> Float[np.ndarray, " fit"]:
+    """An element of all fits in its scaled unit."""
+    return np.asarray(getattr(fits.circuit, name)) / DISPLAY[unit][0]
+
+
+def _widen(axis: Axes, low: float, high: float) -> None:
+    """Make the axis logarithmic if the values are far apart."""
+    if 0 < NARROW * low < high:
+        axis.set_xscale("log")
+        plain_ticks(axis.xaxis)
 
 
 def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) -> bytes:
     """Histograms of χ² and of the largest relative standard error."""
     figure, axes = new_figure(1, 2, (10.0, 2.6))
     left, right = axes[0]
-    left.axvline(1.0, color=COLOURS[3], lw=1.0, ls=":")
+    left.axvline(1.0, color=INK, lw=1.0, ls=":")
     left.set(xlabel="χ² per degree of freedom", ylabel="fits")
     right.set(xlabel="largest relative standard error [%]", ylabel="fits")
     for axis, values in ((left, chi2), (right, 100 * stderr)):
-        known = _drawable(values)
+        known = values[drawable(values)]
         if known.size:
-            wide = known.max() > NARROW * known.min()
-            space = np.geomspace if wide else np.linspace
-            count = min(40, 4 + 2 * round(np.sqrt(known.size)))
-            bins = space(0.99 * known.min(), 1.01 * known.max(), count).tolist()
-            axis.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator("auto", integer=True))
-            axis.hist(known, bins=bins, color=COLOURS[0], edgecolor="white", lw=0.3)
-            if wide:
-                axis.set_xscale("log")
-                plain_ticks(axis.xaxis)
+            low, high = known.min(), known.max()
+            space = np.geomspace if NARROW * low < high else np.linspace
+            bins = space(0.99 * low, 1.01 * high, min(40, 4 + 2 * round(np.sqrt(known.size))))
+            axis.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
+            axis.hist(known, bins=bins.tolist(), color=COLOURS[0], edgecolor="white", lw=0.3)
+            _widen(axis, low, high)
     return svg(figure)
 
 
+@mpl.rc_context(PAPER)
 def by_subject(fits: Fits) -> bytes:
     """Median of each subject, with bars for the middle 50 % and the middle 90 % of the fits.
 
@@ -134,8 +111,7 @@ def by_subject(fits: Fits) -> bytes:
     figure, axes = new_figure(len(units), 1, (width, 2.2 * len(units)), sharex=True)
     thin = 1.0 if subjects.size <= 60 else 0.5
     for axis, (name, unit) in zip(axes[:, 0], units.items(), strict=True):
-        scale = DISPLAY[unit][0]
-        values = np.asarray(getattr(good.circuit, name)) / scale
+        values = _values(good, name, unit)
         for series, condition in enumerate(conditions):
             chosen = good.labels["condition"] == condition
             where, quantiles = _quantiles(place[chosen], values[chosen])
@@ -147,19 +123,19 @@ def by_subject(fits: Fits) -> bytes:
             axis.vlines(where, quantiles[1], quantiles[3], color=colour, lw=2.6 * thin)
             axis.plot(
                 where, quantiles[2], MARKS[series], color=colour, ms=4.5 * thin,
-                markerfacecolor="white", label=_short(condition) or "all",
+                markerfacecolor="white", label=plain(_short(condition)) or "all",
             )  # fmt: skip
         axis.set(yscale="log", ylabel=symbol(name, unit))
         plain_ticks(axis.yaxis)
     last = axes[-1, 0]
     if named:
-        names = [_short(subject) or "-" for subject in subjects]
+        names = [plain(_short(subject)) or "-" for subject in subjects]
         turned = sum(map(len, names)) > 10 * width
         last.set_xticks(range(subjects.size), names, rotation=90 if turned else 0)
     elif subjects.size > CROWD:
         last.set_xticks([])
     last.set_xlabel("subject" if named else "subjects")
-    axes[0, 0].legend(frameon=False, fontsize=8, ncols=SERIES)
+    axes[0, 0].legend(ncols=SERIES)
     return svg(figure)
 
 
@@ -170,13 +146,8 @@ def _thinned(quantiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linspace(0.0, CROWD - 1.0, chosen.size), quantiles[:, chosen]
 
 
-def plain(name: str) -> str:
-    """A name for a figure; dollar signs are escaped, because matplotlib reads them as formulas."""
-    return name.replace("$", r"\$")
-
-
 def _short(name: str, length: int = 16) -> str:
-    return plain(name if len(name) <= length else name[: length - 1] + "…")
+    return name if len(name) <= length else name[: length - 1] + "…"
 
 
 def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -191,22 +162,24 @@ def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
     return where.astype(float), np.array(quantiles).reshape(where.size, 5).T
 
 
+@mpl.rc_context(PAPER)
 def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
     """Variations and errors of each element, side by side on one scale."""
     names = list(dict.fromkeys(one.name for one in found))
     parts = list(found[0].parts)
     figure, axes = new_figure(1, len(names), (3.4 * len(names) + 1, 2.6), sharey=True)
+    for one in found:
+        if one.condition not in conditions:
+            continue
+        series = conditions.index(one.condition)
+        sizes = 100 * np.array(list(one.parts.values()))
+        shown = drawable(sizes)
+        place = np.arange(len(parts)) + 0.15 * (series - (len(conditions) - 1) / 2)
+        axes[0, names.index(one.name)].plot(
+            sizes[shown], place[shown], MARKS[series], color=COLOURS[series], ms=6,
+            label=plain(_short(one.condition)) or "all",
+        )  # fmt: skip
     for axis, name in zip(axes[0], names, strict=True):
-        for series, condition in enumerate(conditions):
-            chosen = [one for one in found if (one.name, one.condition) == (name, condition)]
-            for one in chosen:
-                sizes = 100 * np.array(list(one.parts.values()))
-                shift = 0.15 * (series - (len(conditions) - 1) / 2)
-                shown = drawable(sizes)
-                axis.plot(
-                    sizes[shown], np.arange(len(parts))[shown] + shift, MARKS[series],
-                    color=COLOURS[series], ms=6, label=_short(condition) or "all",
-                )  # fmt: skip
         axis.set(xscale="log", xlabel=f"{symbol(name, '1')}: part of the median [%]")
         low, high = axis.dataLim.intervalx
         if 0 < low <= high < np.inf:
@@ -214,7 +187,7 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
         plain_ticks(axis.xaxis)
     axes[0, 0].set_yticks(range(len(parts)), parts)
     axes[0, 0].set_ylim(len(parts) - 0.5, -0.5)
-    axes[0, 0].legend(frameon=False, fontsize=8)
+    axes[0, 0].legend()
     return svg(figure)
 
 
@@ -243,4 +216,4 @@ def _shortened(fits: Fits, names: Sequence[str]) -> Fits:
 
 def drivers(found: Mapping[str, Driver]) -> bytes:
     """Z_th of drivers, with bands of two standard errors."""
-    return svg(figure_of({_short(name, 60): driver for name, driver in found.items()}))
+    return svg(figure_of({plain(_short(name, 60)): driver for name, driver in found.items()}))

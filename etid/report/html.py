@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 
 import jinja2
 import markupsafe
-import numpy as np
 
 from etid.recordings.replacing import replace_text
 
@@ -43,14 +42,6 @@ class Table:
     folded: bool = False
     links: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.columns):
-                raise ValueError(f"row {row} has {len(row)} cells for {len(self.columns)} columns")
-        spanned = sum(span for _, span in self.groups)
-        if self.groups and spanned != len(self.columns):
-            raise ValueError(f"the groups span {spanned} columns of {len(self.columns)}")
-
     def __str__(self) -> str:
         lines = [self.columns, *self.rows]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
@@ -68,11 +59,6 @@ class Table:
         """Whether each column holds words; such columns are aligned to the left."""
         columns = ([row[i] for row in self.rows if row[i]] for i in range(len(self.columns)))
         return [all(cell[:1].isalpha() for cell in column) for column in columns]
-
-
-def number(value: float | np.floating) -> str:
-    """A number with two decimals, or with three digits if it is 10 000 or more."""
-    return f"{value:.2f}" if abs(value) < 1e4 else f"{value:.3g}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +129,19 @@ def _marked(text: str) -> markupsafe.Markup:
     return markupsafe.Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(markupsafe.escape(text))))
 
 
+def template(name: str) -> jinja2.Template:
+    """A file of `templates`; what is filled in is escaped if it is HTML."""
+    of = jinja2.Environment(
+        loader=jinja2.PackageLoader("etid.report"),
+        autoescape=jinja2.select_autoescape(),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    of.filters |= {"marked": _marked, "paragraphs": _paragraphs}
+    return of.get_template(name)
+
+
 def write_page(
     path: str | os.PathLike[str], title: str, text: str, sections: Sequence[Section]
 ) -> None:
@@ -154,19 +153,11 @@ def write_page(
         text: One paragraph that says what the page shows.
         sections: The sections in their order. No two headings may be equal.
     """
-    pages = jinja2.Environment(
-        loader=jinja2.PackageLoader("etid.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    pages.filters |= {"marked": _marked, "paragraphs": _paragraphs}
     searchable = any(table.searchable for section in sections for table in section.tables)
     script = importlib.resources.files("etid.report").joinpath("templates/table.js")
     text_of_script = script.read_text("utf-8") if searchable else ""
     digest = base64.b64encode(hashlib.sha256(text_of_script.encode()).digest()).decode()
-    page = pages.get_template("page.html").render(
+    page = template("page.html").render(
         title=title,
         text=text,
         sections=sections,

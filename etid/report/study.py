@@ -21,7 +21,7 @@ from etid.report import figures
 from etid.report import tables as study_tables
 from etid.report.html import Picture, Section, write_page
 from etid.report.methods import methods_section, succeeded, words
-from etid.report.waveforms import Recordings, relative_stderr, waveforms
+from etid.report.waveforms import find, relative_stderr, waveforms
 from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, own_part
@@ -58,44 +58,42 @@ def write_report(
             that is read.
         RecordingError: `recordings` is not a file of recordings.
     """
-    file = None if isinstance(fits, StudyFits | Fits) else pathlib.Path(fits)
+    file = None
     if isinstance(fits, StudyFits):
         found = fits
     elif isinstance(fits, Fits):
         found = StudyFits(fits, {}, {})
     else:
-        found = StudyFits.read(fits, circuit)
+        file = pathlib.Path(fits)
+        found = StudyFits.read(file, circuit)
     if not len(found.fits):
         raise ValueError(f"{file or 'fits'}: there is no fit to report on")
-    for read in (file, recordings):
-        if isinstance(read, str | os.PathLike) and _same(read, page):
+    for read in (file, None if isinstance(recordings, Study) else recordings):
+        if read and all(map(os.path.exists, (read, page))) and os.path.samefile(read, page):
             raise ValueError(f"{page} would replace a file that is read; name another page")
-    name = "fits" if file is None else file.name
-    place = Recordings(found, file, recordings)
+    study, problem = find(found, file, recordings)
     try:
-        drawn = waveforms(found.fits, place)
-        if len(found.fits) == 1:
-            sections = [_single(found.fits), drawn, _drivers(found), methods_section(found)]
-        else:
-            groups = found.fits.summary("subject", "condition")
-            sections = [
-                _verdicts(found.fits),
-                _drivers(found),
-                _elements(found.fits, groups),
-                _subjects(found.fits, groups),
-                *_electrodes(found.fits, layout),
-                _quality(found.fits),
-                _recordings(found.fits, drawn),
-                drawn,
-                methods_section(found),
-            ]
+        drawn = waveforms(found, study, problem)
     finally:
-        place.close()
+        if study is not None and study is not recordings:
+            study.close()
+    if len(found.fits) == 1:
+        sections = [_single(found.fits), drawn, _drivers(found), methods_section(found)]
+    else:
+        groups = found.fits.summary("subject", "condition")
+        sections = [
+            _verdicts(found.fits),
+            _drivers(found),
+            _elements(found.fits, groups),
+            _subjects(found.fits, groups),
+            *_electrodes(found.fits, layout),
+            _quality(found.fits),
+            _recordings(found.fits, drawn),
+            drawn,
+            methods_section(found),
+        ]
+    name = "fits" if file is None else file.name
     write_page(page, f"Report on {name}", summary(found), sections)
-
-
-def _same(one: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
-    return os.path.exists(one) and os.path.exists(other) and os.path.samefile(one, other)
 
 
 def summary(found: StudyFits) -> str:
@@ -139,10 +137,9 @@ def _drivers(found: StudyFits) -> Section:
     count = len(found.drivers) + len(found.failures)
     if count > study_tables.ROWS:
         text += f" {study_tables.ROWS} of {count} are shown, those without success first."
-    shown = {", ".join(paths): driver for paths, driver in found.drivers.items()}
-    most = 4  # drivers in one diagram
-    shown = dict(sorted(shown.items())[:most])
-    pictures = ()
+    most, pictures = 4, ()  # drivers in one diagram
+    named = {", ".join(paths): driver for paths, driver in found.drivers.items()}
+    shown = dict(sorted(named.items())[:most])
     if shown:
         caption = "Source impedance"
         if len(found.drivers) > most:
@@ -227,11 +224,14 @@ def _electrodes(fits: Fits, layout: Layout) -> list[Section]:
     names = set(map(str, fits.labels["electrode"])) - {""}
     if len(names) < 2:
         return []
-    text = "The same by electrode. Subjects are part of what varies here."
-    rows = fits.summary("electrode", "condition")
+    by = ("electrode", "condition")
+    rows = fits.summary(*by)
     if not names <= set(layout.electrodes):
-        text += " For maps, give the places of the electrodes: etid report --layout FILE."
-        return [_grouped("Electrodes", text, rows, ("electrode", "condition"), fits, ())]
+        text = (
+            "The same by electrode. Subjects are part of what varies here. For maps, give the "
+            "places of the electrodes: etid report --layout FILE."
+        )
+        return [_grouped("Electrodes", text, rows, by, fits, ())]
     shown, count = figures.mapped(fits)
     text = (
         "Median of the successful trials of each electrode, on one scale. The table has the same "
@@ -248,8 +248,7 @@ def _electrodes(fits: Fits, layout: Layout) -> list[Section]:
         )
         for name in fits.circuit.units()
     )
-    of = _grouped("Electrodes", text, rows, ("electrode", "condition"), fits, pictures)
-    return [dataclasses.replace(of, tables=(dataclasses.replace(of.tables[0], folded=True),))]
+    return [_grouped("Electrodes", text, rows, by, fits, pictures, folded=True)]
 
 
 def _grouped(
@@ -259,6 +258,8 @@ def _grouped(
     by: tuple[str, ...],
     fits: Fits,
     pictures: tuple[Picture, ...],
+    *,
+    folded: bool = False,
 ) -> Section:
     if len(rows) > study_tables.ROWS:
         call = ", ".join(f'"{name}"' for name in by)
@@ -267,7 +268,7 @@ def _grouped(
             f"of fits without success; etid.Fits.summary({call}) has all."
         )
     table = study_tables.groups(rows, by, fits.circuit.units())
-    return Section(heading, text, (table,), pictures)
+    return Section(heading, text, (dataclasses.replace(table, folded=folded),), pictures)
 
 
 def _quality(fits: Fits) -> Section:

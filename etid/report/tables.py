@@ -59,47 +59,46 @@ def drivers(
     found: Mapping[tuple[str, ...], Driver], failures: Mapping[tuple[str, ...], str]
 ) -> Table:
     """The drivers, failed ones first; at most `ROWS`."""
+    heads = (
+        "calibrations", "R_L [kΩ]", "order", "estimator", "verdict", "RRSE [%]", "χ²",
+        "|Z_th| at 1 kHz [kΩ]", "remark",
+    )  # fmt: skip
     rows = [
         (_calibrations(paths), "", "", "", "failed", "", "", "", text)
         for paths, text in failures.items()
     ]
+    frequency = jax.device_put(np.array([1e3]))
     chosen = sorted(found.items(), key=lambda item: (item[1].verdict == "successful", item[0]))
     for paths, driver in chosen[: max(0, ROWS - len(rows))]:
-        z, error = _at_1_khz(driver)
-        resistors = (
-            driver.calibration.r_load.tolist() if isinstance(driver, ContinuousDriver) else []
-        )
+        z, error = driver.response(frequency)[0], driver.response_stderr(frequency)[0]
+        resistors = driver.calibration.r_load if isinstance(driver, ContinuousDriver) else ()
         rows.append(
             (
                 _calibrations(paths),
-                ", ".join(f"{r / 1e3:.6g}" for r in resistors),
+                ", ".join(f"{float(r) / 1e3:.6g}" for r in resistors),
                 str(driver.order),
                 driver.method,
                 driver.verdict,
                 significant(100 * float(driver.rrse)),
                 significant(float(driver.chi2), 3),
-                element(abs(z), error, 1e3),
+                element(abs(complex(z)), float(error), 1e3),
                 message(driver.verdict),
             )
         )
-    heads = (
-        "calibrations", "R_L [kΩ]", "order", "estimator", "verdict", "RRSE [%]", "χ²",
-        "|Z_th| at 1 kHz [kΩ]", "remark",
-    )  # fmt: skip
-    if not any(row[-1] for row in rows):
-        return Table(heads[:-1], tuple(row[:-1] for row in rows))
-    return Table(heads, tuple(rows[:ROWS]))
+    return Table(*_without_empty(heads, rows[:ROWS]))
+
+
+def _without_empty(
+    heads: Sequence[str], rows: Sequence[Sequence[str]]
+) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
+    """Headings and rows, without the last column if it is empty."""
+    end = None if any(row[-1] for row in rows) else -1
+    return tuple(heads[:end]), tuple(tuple(row[:end]) for row in rows)
 
 
 def _calibrations(paths: Sequence[str]) -> str:
     shown = ", ".join(paths[:4])
     return shown if len(paths) <= 4 else f"{shown} and {len(paths) - 4} more"
-
-
-def _at_1_khz(driver: Driver) -> tuple[complex, float]:
-    frequency = jax.device_put(np.array([1e3]))
-    z = complex(np.asarray(driver.response(frequency))[0])
-    return z, float(np.asarray(driver.response_stderr(frequency))[0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,14 +152,13 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
         for name in fits.circuit.names():
             medians = np.array([group[name] for group in rows])
             values = np.asarray(getattr(chosen.circuit, name))
-
-            def part(key: str, of: str = name, rows: Sequence[Mapping[str, Any]] = rows) -> float:
-                ratios = np.array([group[f"{of}_{key}"] / group[of] for group in rows])
-                known = ratios[np.isfinite(ratios)]
-                return float(np.median(known)) if known.size else math.nan
-
-            spread = float(np.std(medians, ddof=1)) if medians.size > 1 else math.nan
             low, high = np.quantile(values, [0.05, 0.95]).tolist()
+            spread = float(np.std(medians, ddof=1)) if medians.size > 1 else math.nan
+            parts = {"between subjects": spread / float(np.median(medians))}
+            for label, part in (
+                ("between recordings", "between"), ("own error", "own"), ("shared error", "shared")
+            ):  # fmt: skip
+                parts[label] = _typical([row[f"{name}_{part}"] for row in rows] / medians)
             found.append(
                 Components(
                     condition=condition,
@@ -170,12 +168,7 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
                     median=float(np.median(values)),
                     low=low,
                     high=high,
-                    parts={
-                        "between subjects": spread / float(np.median(medians)),
-                        "between recordings": part("between"),
-                        "own error": part("own"),
-                        "shared error": part("shared"),
-                    },
+                    parts=parts,
                 )
             )
     return found
@@ -246,11 +239,18 @@ def _typical(values: np.ndarray) -> float:
 def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
     """One row for each recording: labels, verdict, elements, quality, note; at most `SINGLE`.
 
+    Of more fits it shows those without success, and every few of the others.
+
     Args:
         fits: All fits.
         links: Anchors of the waveforms, by path of the recording.
     """
-    some = fits.take(shown_rows(fits))
+    some = fits
+    if len(fits) > SINGLE:
+        bad = np.flatnonzero(fits.verdicts != "successful")[:SINGLE]
+        good = np.flatnonzero(fits.verdicts == "successful")
+        every = np.linspace(0, good.size - 1, SINGLE - bad.size).round().astype(int)
+        some = fits.take(np.union1d(bad, good[every]))
     units = some.circuit.units()
     labels = [name for name in LABELS if len(set(map(str, fits.labels[name]))) > 1]
     scales, heads = {}, ["recording", *labels, "verdict"]
@@ -274,9 +274,7 @@ def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
             )
         )
     heads += ["χ²", "RRSE [%]", "note"]
-    if not any(row[-1] for row in rows):
-        heads, rows = heads[:-1], [row[:-1] for row in rows]
-    return Table(tuple(heads), tuple(rows), searchable=True, links=links)
+    return Table(*_without_empty(heads, rows), searchable=True, links=links)
 
 
 def single(fits: Fits) -> Table:
@@ -291,13 +289,3 @@ def single(fits: Fits) -> Table:
         parts = (significant(float(part[i]) / scale) for part in (own, shared))
         rows.append((heading(name, unit, value), element(value, error, scale), *parts))
     return Table(("element", "value ± standard error", "own error", "shared error"), tuple(rows))
-
-
-def shown_rows(fits: Fits) -> np.ndarray:
-    """Rows of the fits in the table of recordings; of many fits those without success first."""
-    if len(fits) <= SINGLE:
-        return np.arange(len(fits))
-    bad = np.flatnonzero(fits.verdicts != "successful")[:SINGLE]
-    good = np.flatnonzero(fits.verdicts == "successful")
-    some = good[np.linspace(0, good.size - 1, SINGLE - bad.size).round().astype(int)]
-    return np.union1d(bad, some)
