@@ -223,11 +223,31 @@ def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, 
     figure_of(recording)
     assert plt.get_fignums() == before
     monkeypatch.setattr(plt, "show", lambda: None)
-    axes = etid.plot(recording, size=(3.3, 1.8))
+    axes = etid.plot(recording, size=(3.3, 3.6))
     [new] = set(plt.get_fignums()) - set(before)
     assert plt.figure(new) is axes[0].figure
-    np.testing.assert_allclose(axes[0].figure.get_size_inches(), (3.3, 1.8))
+    np.testing.assert_allclose(axes[0].figure.get_size_inches(), (3.3, 3.6))
     plt.close(new)
+
+
+def test_panels_of_a_narrow_figure_stand_below_each_other(recording, driver):
+    import matplotlib.pyplot as plt
+
+    fit = pictures.fit()
+    for call, size, rows in (
+        (lambda size: etid.plot(recording, size=size), (3.3, 3.6), 2),
+        (lambda size: etid.plot(recording, size=size), (6.6, 3.6), 1),
+        (lambda size: etid.plot(fit, recording, driver, show="impedance", size=size), (3.3, 6.0), 3),
+        (lambda size: etid.plot(fit, recording, driver, show="residual", size=size), (12.0, 4.0), 1),
+    ):
+        axes = call(size)
+        figure = axes[0].figure
+        figure.canvas.draw()
+        assert len({round(axis.get_position().y0, 2) for axis in axes}) == rows
+        inches = figure.get_tightbbox()
+        assert inches.x0 > 0
+        assert inches.x1 < size[0]
+        plt.close(figure)
 
 
 def test_the_residual_of_a_wrong_circuit_correlates_with_the_unloaded_voltage(recording, driver):

@@ -4,6 +4,7 @@
 matplotlib.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -19,6 +20,8 @@ from etid.results.fits import Fits
 from etid.results.posterior import Posterior, Profile
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
+
+NARROW = 2.0  # [inch] panels side by side that would be narrower stand below each other
 
 Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
 if TYPE_CHECKING:
@@ -45,7 +48,7 @@ def plot(
     show: Shown = "pulse",
     by: Sequence[str] | None = None,
     map: str | None = None,
-    layout: "Layout | None" = None,
+    layout: "Layout | str | os.PathLike[str] | None" = None,
 ) -> np.ndarray:
     """Draw a recording, a fit, a posterior, a driver, an impedance, fits, bounds and others.
 
@@ -95,10 +98,12 @@ def plot(
             between fits beyond their errors.
         map: Element to draw at each electrode of a display, a map for each subject, session, site
             and condition. An electrode without a successful trial has a mark for its verdict.
-        layout: Places of the electrodes; if not given, `E1` to `E98` of the paper's display.
+        layout: Places of the electrodes, or a file that `etid.read_layout` reads; if not given,
+            `E1` to `E98` of the paper's display.
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
-        size: Width and height of this figure [inch]; if not given, one for a screen.
+        size: Width and height of this figure [inch]; if not given, one for a screen. In a narrow
+            one, panels stand below each other.
         title: Replaces the titles of the picture; None leaves them out, as a paper does.
 
     Returns:
@@ -116,6 +121,8 @@ def plot(
     given = None if axes is None else np.asarray(axes, dtype=object).ravel()
 
     def canvas(rows: int, columns: int, usual: tuple[float, float], **options: Any) -> np.ndarray:
+        if size is not None and rows == 1 < columns and size[0] < NARROW * columns:
+            rows, columns = columns, 1  # as in the column of a paper
         if given is None:
             return new_figure(rows, columns, size or usual, pyplot=True, **options)[1]
         if given.size != rows * columns:
@@ -152,12 +159,12 @@ def _draw(
     show: Shown = "pulse",
     by: Sequence[str] | None = None,
     map: str | None = None,
-    layout: "Layout | None" = None,
+    layout: "Layout | str | os.PathLike[str] | None" = None,
 ) -> np.ndarray:
     import matplotlib as mpl
 
     from etid.plotting import elements, impedances, judging, maps, pulses, style
-    from etid.plotting.layout import FINGERTIP
+    from etid.plotting.layout import FINGERTIP, Layout, read_layout
 
     if show not in get_args(Shown) or (show != "pulse" and not isinstance(x, Fit)):
         allowed = ", ".join(repr(one) for one in get_args(Shown))
@@ -208,7 +215,9 @@ def _draw(
             case Recording(), None, None:
                 return pulses.draw_recording(canvas, x)
             case Fits(), None, None if map is not None:
-                return maps.draw_map(canvas, x, map, layout or FINGERTIP)
+                places = FINGERTIP if layout is None else layout
+                places = places if isinstance(places, Layout) else read_layout(places)
+                return maps.draw_map(canvas, x, map, places)
             case Fits(), None, None:
                 return elements.draw_fits(canvas, x, by or ("subject", "condition"))
             case Posterior(), None, None:

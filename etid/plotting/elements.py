@@ -91,7 +91,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
                 0.995, 0.97, f"{(~shown).sum()} without success outside", color=RED, fontsize=8,
                 transform=axis.transAxes, ha="right", va="top",
             )  # fmt: skip
-        if len(fits) <= 40:  # there is room for the names of the trials
+        if len(fits) <= 40 and axis.figure.get_figwidth() > 5:  # room for the names of the trials
             for row in np.flatnonzero(shown):
                 axis.annotate(
                     plain(str(fits.labels["trial"][row])), (x[row], values[row]), xytext=(4, 3),

@@ -96,10 +96,19 @@ def read_layout(path: str | os.PathLike[str]) -> Layout:
     file = pathlib.Path(path)
     if file.suffix.lower() == ".json":
         return _of_probe(file)
-    with located(str(file), foreign=(ValueError, KeyError, UnicodeDecodeError)):
+    with located(str(file), foreign=UnicodeDecodeError):
         rows = rows_of(file, ("electrode", "x", "y"))
-        x, y = ([float(row[name]) for row in rows] for name in ("x", "y"))
-        return Layout([row["electrode"] for row in rows], np.array(x), np.array(y))
+        x, y = (np.array([_metres(row, name) for row in rows]) for name in ("x", "y"))
+        return Layout([row["electrode"] for row in rows], x, y)
+
+
+def _metres(row: dict[str, str], name: str) -> float:
+    try:
+        return float(row[name])
+    except ValueError:
+        raise RecordingError(
+            f"is {row[name]!r} for electrode {row['electrode']!r}, must be a number", field=name
+        ) from None
 
 
 def _of_probe(file: pathlib.Path) -> Layout:

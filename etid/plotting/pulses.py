@@ -37,8 +37,8 @@ def pulse(recording: Recording) -> slice:
 def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
     """Voltages, and the current if there is one: the whole record, and one pulse."""
     current = recording.samples.get("current")
-    rows = 1 if current is None else 2
-    axes = canvas(rows, 2, (9.0, 3.2 if rows == 1 else 4.8), sharex="col")
+    rows, share = (1, "none") if current is None else (2, "col")
+    axes = canvas(rows, 2, (9.0, 3.2 if rows == 1 else 4.8), sharex=share).reshape(rows, 2)
     milliseconds = 1e3 * recording.time
     for column, part in enumerate((slice(None), pulse(recording))):
         time, axis = milliseconds[part], axes[0, column]
