@@ -322,6 +322,12 @@ def test_an_innovation_and_its_moving_mean_are_those_of_their_formulas():
     np.testing.assert_allclose(moving.d, 0.9 * mean + 0.1 * d)
     np.testing.assert_allclose(moving.cov, 0.81 * BEFORE / 1e4 + 0.01 * cov)
     np.testing.assert_allclose(moving.weight, np.linalg.inv(moving.cov))
+    # An element that changes alone is named however well the others are known: (W e_i)_j² / W_jj is
+    # largest for j = i, by Cauchy and Schwarz.
+    root = np.random.default_rng(0).normal(size=(3, 3)) * [[1.0], [30.0], [0.1]]
+    cov = jnp.asarray(root @ root.T)
+    for number, d in enumerate(jnp.eye(3)):
+        assert int(alarms.Innovation(d, jnp.linalg.inv(cov), cov).element()) == number
 
 
 LANES = 20

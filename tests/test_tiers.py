@@ -322,11 +322,14 @@ def test_a_long_compilation_is_announced_once_on_a_terminal_and_not_in_a_file(
 CIRCUITS = etid.SkinLayers(), etid.ParallelRC(), etid.SkinCole(), etid.Resistor()
 METHODS = "steiglitz_mcbride", "equation_error", "output_error", "non_parametric"
 OPTIONS = (
-    *({}, {"prior": {"r_s": (3e4, 1e3)}}, {"fixed": {"r_s": 3.3e4}}),
-    {"bounds": {"r_s": (1e3, 3.3e4)}},
+    {},
     *({"circuit": circuit} for circuit in CIRCUITS),
+    *({"prior": {"r_s": (3e4, 1e3)}}, {"fixed": {"r_s": 3.3e4}}),
+    {"bounds": {"r_s": (1e3, 3.3e4)}},
     *({"method": method} for method in METHODS),
 )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_drawn_recordings_by_all_methods_and_circuits_are_those_of_xla(options, by_xla):
@@ -353,6 +356,7 @@ def test_drawn_recordings_by_all_methods_and_circuits_are_those_of_xla(options, 
             same_fit(skin(), by_xla(skin))
 
 
+@pytest.mark.slow
 def test_joint_fits_are_those_of_xla(studies, by_xla):
     for study in (studies["dry", 60.0], studies["damp", 60.0]):
         by_numpy = etid.identify_jointly(study).fits
