@@ -71,6 +71,8 @@ def test_the_best_circuit_is_adequate_and_a_richer_one_pays_for_its_elements():
         (penalty + 2.1, 1),
     ):
         assert best({0: made(skin, 990.0), 1: made(cole, 990.0 - gain)}) == chosen
+    # Of two with equal evidence it is the simpler one.
+    assert best({0: made(skin, 990.0), 1: made(etid.ParallelRC(), 990.0 + penalty)}) == 1
     found = bic({0: made(skin, 4060.0), 1: made(cole, 4000.0)})
     assert found[0] - found[1] == pytest.approx(15.0 - penalty)  # 60 at four times the noise is 15
     unclear, misfit = made(skin, 900.0, "insensitive"), made(etid.Resistor(), 2000.0, "misfit")
