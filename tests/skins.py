@@ -1,5 +1,7 @@
 """Skins of these tests, and how far from them a fit is."""
 
+import dataclasses
+
 import numpy as np
 
 import etid
@@ -14,6 +16,12 @@ def relative(fit):
 
 
 def off(fit, truth=DRY):
-    """Errors of the elements of one fit or of several, in standard errors."""
-    error = np.asarray(fit.circuit.values()) - np.asarray(truth.values())
+    """Errors of the elements of one fit or of several, in standard errors.
+
+    Args:
+        fit: One fit, or several along the first axis.
+        truth: A circuit or a load, or values [SI] for each fit or for all.
+    """
+    truth = dataclasses.astuple(truth) if dataclasses.is_dataclass(truth) else truth
+    error = np.asarray(fit.circuit.values()) - np.asarray(truth)
     return error / np.asarray(fit.stderr.values())

@@ -1,6 +1,5 @@
 """A spike or a burst in one of several periods: that period is left out."""
 
-import dataclasses
 import itertools
 import re
 
@@ -12,6 +11,7 @@ from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.disturbances import joint
+from tests.skins import off
 from tests.test_changes import falling, recorded, trial
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
@@ -26,12 +26,6 @@ def with_spike(recording, period, height=0.1, which="v_out", width=1e-3):
     spike = np.where((place > 0) & (place < 1), np.sin(np.pi * place), 0.0)
     volts = getattr(recording, which) + height / rung("dry").scale * spike
     return recording.replace(**{which: volts})
-
-
-def off(fits, load):
-    """Errors of all elements, in standard errors."""
-    truth = np.array(dataclasses.astuple(LOADS[load]))
-    return (np.asarray(fits.circuit.values()) - truth) / np.asarray(fits.stderr.values())
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +44,7 @@ def test_a_disturbed_period_is_left_out_and_the_elements_are_right(driver, load,
     fits = etid.identify_skins(records, driver)
     assert set(fits.verdicts) == {"successful"}
     np.testing.assert_array_equal(np.asarray(fits.fit.remarks) & LEFT_OUT, LEFT_OUT)
-    assert np.abs(off(fits, load)).max() < 4.0  # one of 12 normal numbers in 1300
+    assert np.abs(off(fits, LOADS[load])).max() < 4.0  # one of 12 normal numbers in 1300
 
 
 def test_the_log_says_what_was_done_to_a_recording(driver, caplog, capsys):
@@ -153,4 +147,4 @@ def test_two_periods_of_little_noise_are_fitted_where_aliases_are_small(load):
     three = etid.identify_driver(rung(load, snr_db=80.0).simulate(0)[CALIBRATION])
     fits = etid.identify_skins([trial(scene, seed) for seed in range(4)], three)
     assert set(fits.verdicts) == {"successful"}
-    assert np.abs(off(fits, load)).max() < 5.0  # a bias of two, and noise
+    assert np.abs(off(fits, LOADS[load])).max() < 5.0  # a bias of two, and noise

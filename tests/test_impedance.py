@@ -8,6 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import etid
+from tests.skins import DRY, off
 
 # Fitted without weights by impedance.py's makers and by others (SOURCE.txt of the data).
 PUBLISHED = {
@@ -15,7 +16,6 @@ PUBLISHED = {
     "Circuit2_EIS_1": (150.3, 502.5, 31.13e-9),
 }
 DRAWS = 60  # of fits that take 50 ms; an error of a third too small is seen
-DRY = etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 FEW = np.geomspace(100.0, 1e5, 6)
 
 
@@ -78,22 +78,20 @@ def test_intervals_hold_the_truth(size):
         else:
             fit = etid.identify_impedance(*spectrum(DRY, size, seed))
         assert int(fit.remarks) == 0
-        error = np.asarray(fit.circuit.values()) - np.asarray(DRY.values())
-        inside.append(np.abs(error) < 1.96 * np.asarray(fit.stderr.values()))
+        inside.append(np.abs(off(fit)) < 1.96)
     assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / DRAWS)).all()
     assert size is not None or abs(np.mean(chi2) - 1) < 3 * np.sqrt(2 / 97 / DRAWS)
 
 
 def test_few_points_determine_themselves_and_the_errors_know_it():
     """Of 12 numbers three are fitted: the residual has three quarters of the noise's variance."""
-    rng, z, off = np.random.default_rng(0), np.asarray(DRY.response(FEW)), []
+    rng, z, z_scores = np.random.default_rng(0), np.asarray(DRY.response(FEW)), []
     for _ in range(DRAWS):
         noise = 0.01 * np.abs(z) * (rng.normal(size=6) + 1j * rng.normal(size=6))
         fit = etid.identify_impedance(FEW, z + noise)
-        error = np.asarray(fit.circuit.values()) - np.asarray(DRY.values())
-        off.append(error / np.asarray(fit.stderr.values()))
+        z_scores.append(off(fit))
     # 180 numbers, of which some 120 are independent: three standard errors of their size.
-    assert abs(np.sqrt(np.mean(np.square(off))) - 1) < 0.2
+    assert abs(np.sqrt(np.mean(np.square(z_scores))) - 1) < 0.2
 
 
 def test_noise_that_is_told_too_small_is_a_misfit_with_errors_as_large_as_it_is():
@@ -143,9 +141,8 @@ def test_errors_of_calibration_widen_the_standard_errors():
             frequency, z * (1 + 0.005 * np.sin(np.log(frequency) + phase))
         )
         assert "not white noise" in str(fit)
-        error = np.asarray(fit.circuit.values()) - np.asarray(DRY.values())
         # 2 standard errors are 95 %, of 18 numbers that are not drawn by chance.
-        assert (np.abs(error) < 2 * np.asarray(fit.stderr.values())).all()
+        assert (np.abs(off(fit)) < 2).all()
         assert (np.asarray(fit.stderr.values()) < 0.03 * np.asarray(DRY.values())).all()
 
 
@@ -159,8 +156,7 @@ def test_two_layers_do_not_end_as_one():
     parts = rng.standard_normal((2, frequency.size))
     z = z + sigma * (parts[0] + 1j * parts[1])
     fit = etid.identify_impedance(frequency, z, stderr=sigma, circuit=etid.SkinLayers())
-    error = np.asarray(fit.circuit.values()) - np.asarray(truth.values())
-    assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
+    assert (np.abs(off(fit, truth)) < 4).all()
 
 
 def test_a_fit_to_an_impedance_is_drawn_with_its_points():

@@ -86,7 +86,7 @@ def test_known_elements_of_a_joint_fit_help_the_others(study, outcome):
     few = Study.from_recordings([study[path] for path in ("calibration/0", *TOGETHER)])
     free = outcome.fits.where(path=TOGETHER[0])[0]
     tolerance = etid.Instrument(r_load=0.01)
-    fixed = etid.identify_jointly(few, fixed={"r_s": DRY.r_s}, instrument=tolerance)
+    fixed = etid.identify_jointly(few, fixed={"r_s": float(DRY.r_s)}, instrument=tolerance)
     for fit in fixed.fits:
         assert fit.verdict == "successful"
         np.testing.assert_allclose(fit.circuit.r_s, DRY.r_s, rtol=1e-8)
@@ -94,7 +94,7 @@ def test_known_elements_of_a_joint_fit_help_the_others(study, outcome):
         assert (np.abs(off(fit)[1:]) < SIGMAS).all()
     assert fixed.settings is not None
     assert fixed.settings.fixed == ("r_s 33400.0",)
-    told = etid.identify_jointly(few, prior={"r_p": (DRY.r_p, 10.0)}).fits[0]
+    told = etid.identify_jointly(few, prior={"r_p": (float(DRY.r_p), 10.0)}).fits[0]
     assert told.stderr.r_p < 10.0 < 0.1 * free.stderr.r_p
     assert told.stderr.r_s < free.stderr.r_s
 

@@ -19,6 +19,7 @@ from etid.online.tracker import Tracker
 from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, Sampler, SkinLoad, loading
+from tests.skins import off
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
@@ -100,11 +101,6 @@ def after_amplitude(state, amplitude):
     return dataclasses.replace(
         state, electrodes=dataclasses.replace(state.electrodes, amplitude=given)
     )
-
-
-def off(fits, truth):
-    """Errors of all elements, in standard errors."""
-    return (np.asarray(fits.circuit.values()) - truth) / np.asarray(fits.stderr.values())
 
 
 def test_the_second_pulse_compiles_nothing_and_a_state_is_printed_without_arrays():
