@@ -1,6 +1,7 @@
 """Skins of these tests, and how far from them a fit is."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ def relative(fit):
     return np.asarray(fit.stderr.values()) / np.asarray(fit.circuit.values())
 
 
-def off(fit, truth=DRY):
+def off(fit, truth: Any = DRY):
     """Errors of the elements of one fit or of several, in standard errors.
 
     Args:

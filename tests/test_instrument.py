@@ -190,14 +190,15 @@ def test_a_joint_fit_finds_a_gain_that_moves_r_p_by_a_third():
 
 def test_a_budget_of_a_joint_fit_says_what_an_error_that_nobody_stated_does():
     # Without jitter each study would limit its delays by another width.
-    loads, jitter = {"0": DRY, "1": DRY}, {"trigger_jitter_rms": 50e-9}
-    right = trials(loads, **jitter)
+    loads = {"0": DRY, "1": DRY}
+    right = trials(loads, trigger_jitter_rms=50e-9)
     found = etid.identify_jointly(right, instrument=etid.Instrument())
     (driver,) = found.drivers.values()
     budget = found.fits[0].budget(right["0"], driver)
     # 1 pF moves the driver of a joint fit along its curved valley: its effect is not linear.
     for source in sorted({*TOLERANCES} - {"capacitance"}):
-        wrong = trials(loads, **jitter, **{source: TOLERANCES[source][1]})
+        error: dict[str, Any] = {source: TOLERANCES[source][1]}
+        wrong = trials(loads, trigger_jitter_rms=50e-9, **error)
         other = together(wrong)["0"]
         before, after = (np.log(np.asarray(of.circuit.values())) for of in (found.fits[0], other))
         told = budget.unstated[source]
@@ -265,7 +266,7 @@ def test_a_tracker_has_the_errors_of_the_instrument(kind):
         np.testing.assert_allclose(added, moved, rtol=0.1, atol=0.05 * moved.max(), err_msg=source)
 
 
-def drawn(number):
+def drawn(number) -> dict[str, Any]:
     """Errors of an instrument, drawn from their tolerances."""
     draw = np.random.default_rng([number, 5])
     of = {name: size * draw.standard_normal() for name, size in ALL.stored().items()}

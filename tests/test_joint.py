@@ -8,6 +8,7 @@ import pytest
 
 import etid
 from benchmarks.failure_axes import Cole
+from benchmarks.ladder import LOADS
 from etid.recordings.remarks import Remark
 from etid.recordings.study import Study
 from etid.simulation.scenes import Scene, Trial
@@ -116,7 +117,7 @@ def test_bounds_of_a_joint_fit_leave_the_driver_as_it_is(study, outcome):
 
 def test_another_skin_is_a_misfit_where_chi2_does_not_show_it():
     """R_s would be wrong by more than five of its standard errors and called successful."""
-    odd = Trial("odd", Cole(DRY, alpha=0.9), condition="odd")
+    odd = Trial("odd", Cole(LOADS["dry"], alpha=0.9), condition="odd")
     study = simulate(odd, seed=4, snr_db=40.0)
     fits = etid.identify_jointly(study).fits
     another = fits.where(path="odd")

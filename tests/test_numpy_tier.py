@@ -2,6 +2,7 @@
 
 import functools
 import tracemalloc
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -156,9 +157,9 @@ def test_whole_powers(dtype):
         check(lambda x, of: jax.tree.map(lambda y: lax.pow(x, y), of), x, full, rounding=100)
 
 
-CONVERTED = {of: (*REAL, np.int64, np.int32, np.bool_) for of in (*REAL, np.int64, np.bool_)}
-CONVERTED[np.float64] += COMPLEX
-CONVERTED[np.complex128] = (np.complex64,)
+PLAIN = (*REAL, np.int64, np.int32, np.bool_)
+CONVERTED: dict[Any, Any] = {of: PLAIN for of in (*REAL, np.int64, np.bool_)}
+CONVERTED |= {np.float64: PLAIN + COMPLEX, np.complex128: (np.complex64,)}
 
 
 @pytest.mark.parametrize("old", CONVERTED)

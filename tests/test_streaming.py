@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
 import h5py
 import numpy as np
@@ -68,7 +69,7 @@ def test_parts_are_the_whole(source, whole, tmp_path):
     for name, own in (("alone.h5", False), ("first.h5", True), ("second.h5", True)):
         target = tmp_path / name
         with concurrent.futures.ThreadPoolExecutor(1) as executor:
-            options = {"executor": executor} if own else {}
+            options: dict[str, Any] = {"executor": executor} if own else {}
             outcome = fit_file(source, target, method=METHOD, **options)
         same(target, whole)
         assert len(outcome.fits) == COUNT
