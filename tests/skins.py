@@ -23,6 +23,6 @@ def off(fit, truth: Any = DRY):
         fit: One fit, or several along the first axis.
         truth: A circuit or a load, or values [SI] for each fit or for all.
     """
-    truth = dataclasses.astuple(truth) if dataclasses.is_dataclass(truth) else truth
+    truth = dataclasses.astuple(truth) if hasattr(truth, "__dataclass_fields__") else truth
     error = np.asarray(fit.circuit.values()) - np.asarray(truth)
     return error / np.asarray(fit.stderr.values())
