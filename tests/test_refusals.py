@@ -15,6 +15,7 @@ import pytest
 
 import etid
 from etid.circuits.impedance import realise
+from etid.identify.options import Options
 from etid.plotting import figure_of
 from etid.plotting.style import new_figure, save
 from etid.results.driver import ContinuousDriver
@@ -76,6 +77,7 @@ etid.identify_driver(of.calibration, method='steiglitz_mcbride(iterations=0)')
     -> has no such options
 etid.identify_driver(of.calibration, method='steiglitz_mcbride(iterations=')
     -> has no such options
+Options.of(method='proportion') -> not known; use one of maximum_likelihood
 etid.register(etid.SteiglitzMcBride(iterations=3)) -> is the name of SteiglitzMcBride
 etid.identify_amplitudes([of.alone], circuit=Twice()) -> 2 resistors that depend on their current
 etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 2.0]) -> shape
@@ -258,7 +260,7 @@ def limited(of, **limits):
 
 
 USED = cut, faster, skin, samples, tracker, of_others, limited, Twice
-TAKEN = realise, figure_of, new_figure, save, ContinuousDriver, verdict, Rational
+TAKEN = realise, figure_of, new_figure, save, ContinuousDriver, verdict, Rational, Options
 NAMES = {one.__name__: one for one in (*USED, *TAKEN)} | {
     "etid": etid,
     "np": np,
