@@ -1,7 +1,5 @@
 """Records of two triggers are aligned by whole samples, before a fit and in it."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -11,16 +9,13 @@ from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.pulse_train import find_pulses, lags_of, whole_lag
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.simulation.transformer import ResistorLoad
+from tests.skins import DAMP, DRY, off
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
 PULSE = 60.0
-LOADS = {
-    "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
-    "damp": SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
-    "resistor": ResistorLoad(21.62e3),
-}
+LOADS = {"dry": DRY, "damp": DAMP, "resistor": etid.Resistor(21.62e3)}
 SIGMAS = 5.0  # one in 2 million for a normal error
 
 
@@ -91,21 +86,19 @@ def test_elements_are_those_without_the_delay(driver):
     fits = etid.identify_skins(records, driver)
     assert fits.counts() == {"successful": 3}
     assert (np.asarray(fits.fit.remarks) == Remark.aligned).all()
-    truth = np.array([dataclasses.astuple(LOADS[name]) for name in names])
-    wrong = np.abs(np.asarray(fits.circuit.values()) - truth)
-    assert (wrong < SIGMAS * np.asarray(fits.stderr.values())).all()
+    truth = np.array([LOADS[name].values() for name in names])
+    assert (np.abs(off(fits, truth)) < SIGMAS).all()
     # The prediction is that of the record as it is: to its noise, 10 mV, and that of V_th.
     circuit = etid.SkinRC(*map(float, np.asarray(fits.circuit.values())[0]))
-    off = etid.predict(records[0], driver, circuit) - records[0].v_out
-    assert np.nanstd(off) < 2 * np.sqrt(2) * float(Inspected(records[0]).sigma[1])
+    rest = etid.predict(records[0], driver, circuit) - records[0].v_out
+    assert np.nanstd(rest) < 2 * np.sqrt(2) * float(Inspected(records[0]).sigma[1])
 
 
 def test_a_calibration_that_is_late_serves_as_well():
     late = etid.identify_driver(simulate(-5.0, seed=6)["98k8"])
     assert late.remarks == Remark.aligned
     fit = etid.identify_skin(simulate(seed=8)["dry"], late)
-    wrong = np.abs(np.asarray(fit.circuit.values()) - dataclasses.astuple(LOADS["dry"]))
-    assert (wrong < SIGMAS * np.asarray(fit.stderr.values())).all()
+    assert (np.abs(off(fit)) < SIGMAS).all()
 
 
 def test_what_looks_later_than_it_is_is_aligned_again(driver, monkeypatch):
@@ -115,9 +108,8 @@ def test_what_looks_later_than_it_is_is_aligned_again(driver, monkeypatch):
     alone = etid.identify_skin(record, driver)
     fits = etid.identify_skins([record, simulate(0.0, seed=9)["dry"]], driver)
     assert fits.counts() == {"successful": 2}
-    for fit in (alone.circuit.values(), np.asarray(fits.circuit.values())[0]):
-        wrong = np.abs(np.asarray(fit) - dataclasses.astuple(LOADS["dry"]))
-        assert (wrong < SIGMAS * np.asarray(alone.stderr.values())).all()
+    for fit in (alone, fits[0]):
+        assert (np.abs(off(fit)) < SIGMAS).all()
 
 
 @pytest.mark.slow
@@ -128,8 +120,7 @@ def test_a_joint_fit_aligns_its_recordings():
     trials += [late[n].replace(path=f"b/{n}") for n in names]
     found = etid.identify_jointly(etid.Study.from_recordings([study["98k8"], *trials]))
     assert found.fits.counts() == {"successful": 4}
-    truth = np.array([dataclasses.astuple(LOADS[name]) for name in names * 2])
-    wrong = np.abs(np.asarray(found.fits.circuit.values()) - truth)
-    assert (wrong < SIGMAS * np.asarray(found.fits.stderr.values())).all()
+    truth = np.array([LOADS[name].values() for name in names * 2])
+    assert (np.abs(off(found.fits, truth)) < SIGMAS).all()
     remarks = np.asarray(found.fits.fit.remarks)
     np.testing.assert_array_equal(remarks, [0, 0, int(Remark.aligned), int(Remark.aligned)])

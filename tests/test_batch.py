@@ -11,12 +11,11 @@ import pytest
 import etid
 from etid.identify import fitting
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.simulation.transformer import ResistorLoad
+from tests.skins import DRY, off
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 LENGTH = 10_000
-DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
-TRUTH = np.array([33.4e3, 186e3, 0.12e-9])
 SIGMAS = 5.0  # one in 2 million for a normal error, which the coverage test measures
 FEW = 16  # lanes of a call, so that few recordings need several calls
 MANY = FEW + 2
@@ -64,15 +63,13 @@ def assert_same(one, other):
         np.testing.assert_array_equal(a, b)
 
 
-def test_more_than_a_chunk_keeps_the_order(study, fits):
+def test_more_than_a_chunk_keeps_the_order_and_neither_chunk_nor_lane_changes_a_bit(
+    study, driver, fits
+):
+    """Reversed, every recording sits in another lane of another chunk, next to other lanes."""
     assert fits.labels["path"].tolist() == list(study.loaded)
     assert fits.counts() == {"successful": MANY}
-    error = np.asarray(fits.circuit.values()) - TRUTH
-    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
-
-
-def test_neither_chunk_nor_lane_changes_a_bit(study, driver, fits):
-    """Reversed, every recording sits in another lane of another chunk, next to other lanes."""
+    assert (np.abs(off(fits)) < SIGMAS).all()
     paths = list(study.loaded)[::-1]
     again = etid.identify_skins([study[path] for path in paths], driver)
     assert_same(again, rows(fits, paths))
@@ -103,22 +100,25 @@ def test_one_function_per_length_serves_all_drivers(study, driver, monkeypatch):
 
 
 def test_a_failed_driver_costs_its_own_recordings():
+    """Also one whose calibration does not exist, or has no known resistor."""
     study = simulate(4, calibrations=2, seed=6)
+    named = ("calibration/0", "calibration/1", "nowhere", "s01/dry/0")
     records = [
         study["calibration/0"],
         study["calibration/1"].replace(v_out=np.zeros(LENGTH)),
         *(
-            study[path].replace(calibration=f"calibration/{i % 2}")
-            for i, path in enumerate(study.loaded)
+            study[path].replace(calibration=of)
+            for path, of in zip(study.loaded, named, strict=True)
         ),
     ]
     result = etid.identify_study(etid.Study.from_recordings(records))
-    assert result.fits.verdicts.tolist() == ["successful", "driver_failed"] * 2
+    assert result.fits.verdicts.tolist() == ["successful", *["driver_failed"] * 3]
     assert list(result.drivers) == [("calibration/0",)]
-    assert list(result.failures) == [("calibration/1",)]
-    for note in result.fits.notes[1::2]:
-        assert "'calibration/1': flat" in note
-    assert result.fits.notes[0] == ""
+    assert ("calibration/1",) in result.failures
+    good, flat, *none = result.fits.notes
+    assert good == ""
+    assert "'calibration/1': flat" in flat
+    assert all(name in note for name, note in zip(named[2:], none, strict=True))
 
 
 def test_a_driver_without_success_is_kept_and_marks_its_fits(study):
@@ -133,26 +133,6 @@ def test_a_driver_without_success_is_kept_and_marks_its_fits(study):
     assert all(result.fits.notes)
 
 
-@pytest.mark.parametrize("named", ["nowhere", "s01/dry/1"])
-def test_a_calibration_that_is_none_is_named(study, named):
-    """It does not exist, or has no known resistor."""
-    records = [study[path] for path in ("calibration/0", "s01/dry/0", "s01/dry/1")]
-    records[1] = records[1].replace(calibration=named)
-    result = etid.identify_study(etid.Study.from_recordings(records))
-    assert result.fits.verdicts.tolist() == ["driver_failed", "successful"]
-    assert named in result.fits.notes[0]
-
-
-def test_progress_is_shown_only_on_request(study, driver, capsys):
-    records = [study["s01/dry/0"], study["s01/dry/1"].replace(v_out=np.zeros(LENGTH))]
-    etid.identify_skins(records, driver)
-    assert capsys.readouterr() == ("", "")
-    etid.identify_skins(records, driver, progress=True)
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert "2/2" in printed.err
-
-
 # The table of fits
 
 
@@ -165,7 +145,9 @@ def mixed(study, driver):
     return etid.identify_skins(iter(records), driver)
 
 
-def test_failures_are_rows_without_numbers(mixed):
+def test_failures_are_rows_without_numbers_and_progress_is_shown_only_on_request(
+    study, driver, mixed, capsys
+):
     table = mixed.table()
     assert {len(column) for column in table.values()} == {4}
     failed = table["verdict"] == "flat"
@@ -176,6 +158,13 @@ def test_failures_are_rows_without_numbers(mixed):
     assert not any(table["note"][~failed])
     assert mixed.counts() == {"flat": 2, "successful": 2}
     assert len(mixed.successful()) == 2
+    records = [study["s01/dry/0"], study["s01/dry/1"].replace(v_out=np.zeros(LENGTH))]
+    for progress, shown in ((False, ""), (True, "2/2")):
+        etid.identify_skins(records, driver, progress=progress)
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        assert shown in printed.err
+        assert progress or printed.err == ""
 
 
 def test_a_group_without_success_is_counted_and_has_no_median(mixed):
@@ -208,7 +197,7 @@ def test_what_varies_is_the_spread_less_the_noise_of_all_recordings(mixed):
     assert row["r_p_between"] == pytest.approx(varies, rel=0.15)
 
 
-def test_failures_survive_a_file_with_units(mixed, tmp_path):
+def test_failures_survive_a_file_with_units_and_another_circuit_is_refused(mixed, tmp_path):
     file = tmp_path / "fits.h5"
     mixed.write(file)
     again = etid.Fits.read(file)
@@ -221,11 +210,6 @@ def test_failures_survive_a_file_with_units(mixed, tmp_path):
         assert content["r_s_stderr"].attrs["unit"] == "ohm"
         assert content.attrs["method"] == "maximum_likelihood"
         assert content.attrs["etid_version"] == etid.__version__
-
-
-def test_a_file_of_another_circuit_asks_for_it(mixed, tmp_path):
-    file = tmp_path / "fits.h5"
-    mixed.write(file)
     with pytest.raises(ValueError, match=r"is 'etid:SkinRC'\. .* passed is Resistor"):
         etid.Fits.read(file, circuit=etid.Resistor)
     with h5py.File(file, "r+") as content:

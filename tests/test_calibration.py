@@ -20,6 +20,11 @@ def scene():
 
 
 @pytest.fixture(scope="module")
+def study(scene):
+    return scene.simulate(seed=0)
+
+
+@pytest.fixture(scope="module")
 def without_further():
     """Another resistor is not tried."""
     with pytest.MonkeyPatch.context() as patch:
@@ -28,8 +33,8 @@ def without_further():
 
 
 @pytest.fixture(scope="module")
-def today(scene, without_further):
-    return etid.calibrate(scene.simulate(seed=0)["calibration/98k8"])
+def today(study, without_further):
+    return etid.calibrate(study["calibration/98k8"])
 
 
 def stderrs(fit):
@@ -38,8 +43,8 @@ def stderrs(fit):
 
 
 @pytest.mark.slow
-def test_the_worth_of_a_second_resistor_is_that_of_a_real_one(scene):
-    today = etid.calibrate(scene.simulate(seed=0)["calibration/98k8"])
+def test_the_worth_of_a_second_resistor_is_that_of_a_real_one(scene, study):
+    today = etid.calibrate(study["calibration/98k8"])
     second = Trial("calibration/10k", ResistorLoad(10e3))
     both = dataclasses.replace(scene, calibration=(*scene.calibration, second)).simulate(seed=4)
     driver = etid.identify_driver([*both.calibrations.recordings()], order=today.driver.order)
@@ -58,16 +63,13 @@ def test_expected_errors_are_those_of_recordings_of_skin(today, skin):
     assert today.expected[skin][MORE] == pytest.approx(half)
 
 
-def test_the_same_driver_on_another_day_has_not_moved(scene, today):
-    again = etid.calibrate(scene.simulate(seed=5)["calibration/98k8"], former=today.driver)
+def test_the_same_driver_on_another_day_has_not_moved_and_a_wrong_resistor_is_named(scene, today):
+    day = scene.simulate(seed=5)["calibration/98k8"]
+    again = etid.calibrate(day, former=today.driver)
     assert again.moved < 4
     assert "differs from the former driver by" in str(again)
     assert "would be wrong" not in str(again)
-
-
-def test_a_wrong_resistor_is_named(scene, today):
-    wrong = scene.simulate(seed=5)["calibration/98k8"].replace(r_load=93.9e3)
-    found = etid.calibrate(wrong, former=today.driver)
+    found = etid.calibrate(day.replace(r_load=93.9e3), former=today.driver)
     assert found.moved > 100
     assert found.r_load == pytest.approx(98.8e3, rel=1e-3)
     assert "a resistor of 98.8 kΩ in place of 93.9 kΩ would explain it" in str(found)
@@ -95,9 +97,9 @@ def test_the_line_on_what_helps_is_that_of_the_least_known_element(today):
     assert "1 % takes 10 times as many periods" in text  # (0.031 / 0.01)² = 9.6
 
 
-def test_the_command_writes_a_driver_and_a_picture(scene, today, tmp_path, capsys, monkeypatch):
-    study, driver, picture = (tmp_path / name for name in ("study.h5", "driver.h5", "z.svg"))
-    scene.simulate(seed=0).write(study)
+def test_the_command_writes_a_driver_and_a_picture(study, today, tmp_path, capsys, monkeypatch):
+    source, driver, picture = (tmp_path / name for name in ("study.h5", "driver.h5", "z.svg"))
+    study.write(source)
     formers, orders = [], []
 
     def fake(_, *, order, former):
@@ -106,7 +108,7 @@ def test_the_command_writes_a_driver_and_a_picture(scene, today, tmp_path, capsy
         return today
 
     monkeypatch.setattr(command, "calibrate", fake)
-    assert main(["calibrate", str(study), "-o", str(driver), "--picture", str(picture)]) == 0
+    assert main(["calibrate", str(source), "-o", str(driver), "--picture", str(picture)]) == 0
     assert "standard errors to expect of skin" in capsys.readouterr().out
     assert picture.read_text("utf-8").lstrip().startswith("<?xml")
     again = tmp_path / "again.h5"
@@ -116,22 +118,17 @@ def test_the_command_writes_a_driver_and_a_picture(scene, today, tmp_path, capsy
     frequency = np.geomspace(100.0, 80e3, 20)
     assert formers[0] is None
     np.testing.assert_array_equal(formers[1].response(frequency), today.driver.response(frequency))
-
-
-def test_a_file_without_calibrations_is_refused(scene, tmp_path, capsys):
-    study = tmp_path / "study.h5"
-    skin = scene.simulate(seed=0)["typical/dry/01"].replace(calibration=())
-    etid.Study.from_recordings([skin]).write(study)
-    assert main(["calibrate", str(study), "-o", str(tmp_path / "driver.h5")]) == 1
+    etid.Study.from_recordings([study["typical/dry/01"].replace(calibration=())]).write(source)
+    assert main(["calibrate", str(source), "-o", str(tmp_path / "none.h5")]) == 1
     assert "holds no recording with a known resistor" in capsys.readouterr().err
 
 
-def test_a_driver_is_written_with_its_calibrations_and_read_again(scene, tmp_path):
-    calibration = scene.simulate(seed=0)["calibration/98k8"]
+def test_a_driver_is_written_with_its_calibrations_and_read_again(study, tmp_path):
+    calibration = study["calibration/98k8"]
     driver = etid.identify_driver(calibration, method="equation_error", throw=False)
     driver.write(tmp_path / "driver.h5")
-    with etid.read(tmp_path / "driver.h5") as study:
-        [stored] = study.calibrations.recordings()
+    with etid.read(tmp_path / "driver.h5") as written:
+        [stored] = written.calibrations.recordings()
     np.testing.assert_array_equal(stored.v_out, calibration.v_out)
     again = etid.read_driver(tmp_path / "driver.h5", order=5)
     known = etid.identify_driver(calibration)
@@ -190,8 +187,8 @@ def two_named(study):
         ),
     ],
 )
-def test_refusals_of_the_driver_of_another_file(scene, tmp_path, capsys, held, options, message):
-    study, driver = scene.simulate(seed=0), tmp_path / "driver.h5"
+def test_refusals_of_the_driver_of_another_file(study, tmp_path, capsys, held, options, message):
+    driver = tmp_path / "driver.h5"
     study.write(tmp_path / "day.h5")
     if held is not None:
         etid.Study.from_recordings(held(study)).write(driver)
@@ -201,14 +198,13 @@ def test_refusals_of_the_driver_of_another_file(scene, tmp_path, capsys, held, o
     assert not (tmp_path / "fits.h5").exists()
 
 
-def test_a_discrete_driver_of_another_sample_rate_is_refused_for_each_recording(scene, tmp_path):
-    study, driver = scene.simulate(seed=0), tmp_path / "driver.h5"
+def test_a_discrete_driver_of_another_sample_rate_is_refused_for_each_recording(study, tmp_path):
     known = study["calibration/98k8"]
     slower = {"v_th": known.v_th[::2], "v_out": known.v_out[::2], "adc_range": None}
     slow = known.replace(**slower, sample_rate=known.sample_rate / 2)
-    etid.Study.from_recordings([slow]).write(driver)
+    etid.Study.from_recordings([slow]).write(tmp_path / "driver.h5")
     study.write(tmp_path / "day.h5")
-    options = {"driver": driver, "order": 5, "method": "steiglitz_mcbride"}
+    options = {"driver": tmp_path / "driver.h5", "order": 5, "method": "steiglitz_mcbride"}
     found = etid.fit_file(tmp_path / "day.h5", tmp_path / "fits.h5", **options)
     assert not found.fits.counts().get("successful")
     assert "same sample rate" in found.fits.notes[0]

@@ -10,13 +10,11 @@ from benchmarks.ladder import CALIBRATION, recorded
 from benchmarks.perturbed_study import drawn_driver
 from etid.signals.harmonics import ALIASED, aliases
 from etid.simulation.transformer import TransformerDriver
+from tests.skins import DAMP, DRY, off
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
-SKINS = {
-    "dry": etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
-    "damp": etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
-}
+SKINS = {"dry": DRY, "damp": DAMP}
 SIGMAS = 4.0  # one of 16 000 for a normal error; 600 elements are compared below
 
 
@@ -49,12 +47,6 @@ def each(fits):
     return [(fits[number], name) for number, name in enumerate(SKINS)]
 
 
-def off(fit, name):
-    """Errors in standard errors."""
-    values, errors = (np.asarray(of.values()) for of in (fit.circuit, fit.stderr))
-    return (values - np.asarray(SKINS[name].values())) / errors
-
-
 @pytest.mark.parametrize(
     "identify", [etid.identify_study, pytest.param(etid.identify_jointly, marks=pytest.mark.slow)]
 )
@@ -62,7 +54,7 @@ def test_a_fit_is_by_maximum_likelihood_and_right(identify):
     for fit, name in each(identify(study(True)).fits):
         assert fit.verdict == "successful"
         assert fit.method in ("maximum_likelihood", "joint")
-        assert np.abs(off(fit, name)).max() < SIGMAS
+        assert np.abs(off(fit, SKINS[name])).max() < SIGMAS
 
 
 def test_without_a_filter_the_records_are_biased():
@@ -139,7 +131,7 @@ def drawn(**settings):
         fits = etid.identify_skins([of[name] for name in SKINS], driver)
         for fit, name in each(fits):
             if fit.verdict == "successful":
-                errors.append(off(fit, name))
+                errors.append(off(fit, SKINS[name]))
             else:
                 others.append(fit.verdict)
     return np.array(errors), others

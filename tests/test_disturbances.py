@@ -1,5 +1,6 @@
 """A spike or a burst in one of several periods: that period is left out."""
 
+import itertools
 import re
 
 import numpy as np
@@ -10,7 +11,8 @@ from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.disturbances import joint
-from tests.test_changes import falling, recorded
+from tests.skins import off
+from tests.test_changes import falling, recorded, trial
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
@@ -26,15 +28,6 @@ def with_spike(recording, period, height=0.1, which="v_out", width=1e-3):
     return recording.replace(**{which: volts})
 
 
-def off(fits, load):
-    """Errors of all elements, in standard errors."""
-    names = ("r_s", "r_p", "c_p")
-    values = np.stack([getattr(fits.circuit, name) for name in names])
-    errors = np.stack([getattr(fits.stderr, name) for name in names])
-    truth = np.array([[getattr(LOADS[load], name)] for name in names])
-    return (values - truth) / errors
-
-
 @pytest.fixture(scope="module")
 def driver():
     return etid.identify_driver(rung("dry").simulate(0)[CALIBRATION])
@@ -45,17 +38,17 @@ def driver():
 def test_a_disturbed_period_is_left_out_and_the_elements_are_right(driver, load, samples):
     scene = rung(load, samples=samples)
     records = [
-        with_spike(scene.simulate(seed)[TRIAL], seed % 3, (0.1, 1.0)[seed % 2], which)
+        with_spike(trial(scene, seed), seed % 3, (0.1, 1.0)[seed % 2], which)
         for seed, which in enumerate(("v_out", "v_th", "v_out", "v_out"))
     ]
     fits = etid.identify_skins(records, driver)
     assert set(fits.verdicts) == {"successful"}
     np.testing.assert_array_equal(np.asarray(fits.fit.remarks) & LEFT_OUT, LEFT_OUT)
-    assert np.abs(off(fits, load)).max() < 4.0  # one of 12 normal numbers in 1300
+    assert np.abs(off(fits, LOADS[load])).max() < 4.0  # one of 12 normal numbers in 1300
 
 
 def test_the_log_says_what_was_done_to_a_recording(driver, caplog, capsys):
-    clean = rung("dry", samples=20_000).simulate(0)[TRIAL]
+    clean = trial(rung("dry", samples=20_000), 0)
     late = with_spike(clean.replace(v_out=np.roll(clean.v_out, 3)), 2)
     etid.identify_skin(late, driver)
     assert caplog.messages == []
@@ -72,18 +65,18 @@ def test_the_log_says_what_was_done_to_a_recording(driver, caplog, capsys):
 
 def test_a_disturbance_over_a_joint_disturbs_both_periods():
     """Its rest in the second period was kept: R_p 3 % wrong, six standard errors, at 40 dB."""
-    six = rung("dry", snr_db=40.0, samples=20_000).simulate(1)[TRIAL]
+    six = trial(rung("dry", snr_db=40.0, samples=20_000), 1)
     long = with_spike(six, 2.12, width=5e-3, which="v_th")  # from 2.72 to 3.02 periods
     kept = Inspected(long).kept
     assert kept is not None
     np.testing.assert_array_equal(kept.first, [0, 3333, 13_334, 16_667])
     # Of three periods one would remain, so the period with the larger part is left out.
-    three = with_spike(rung("dry").simulate(1)[TRIAL], 0.12, 0.2, "v_th", 5e-3)
+    three = with_spike(trial(rung("dry"), 1), 0.12, 0.2, "v_th", 5e-3)
     assert Inspected(three).periods[0] == 2
 
 
 def test_both_voltages_and_what_is_known_of_them_are_of_the_same_periods():
-    recording = rung("dry").simulate(1)[TRIAL]
+    recording = trial(rung("dry"), 1)
     seen = Inspected(with_spike(recording, 1, 1.0))
     assert seen.kept is not None
     assert seen.periods == (2, 6667)
@@ -118,43 +111,31 @@ def test_a_record_of_the_periods_that_are_kept_is_as_long_as_one_of_so_many(spac
 
 
 @pytest.mark.parametrize("load", LOADS)
-@pytest.mark.parametrize("samples", [10_000, 20_000])
-def test_no_period_of_an_undisturbed_record_is_left_out(load, samples):
-    for snr_db in (20.0, 30.0, 80.0):
-        for jitter in (5e-8, 5e-6):
-            scene = rung(load, samples=samples, snr_db=snr_db, trigger_jitter_rms=jitter)
-            assert Inspected(scene.simulate(3)[TRIAL]).kept is None
-
-
-@pytest.mark.parametrize("name", ["r_s", "r_p", "c_p"])
-def test_skin_that_changes_is_no_disturbance(name):
-    for load in LOADS:
-        scene = rung(load)
-        for loads in (
-            falling(LOADS[load], name, 0.3),
-            [LOADS[load], *falling(LOADS[load], name, 0.3)[1:]][::-1],
-            [LOADS[load], LOADS[load], falling(LOADS[load], name, 0.3)[-1]],
-        ):
+def test_no_period_of_an_undisturbed_record_is_left_out(load):
+    for samples, snr_db, jitter in itertools.product(
+        (10_000, 20_000), (20.0, 30.0, 80.0), (5e-8, 5e-6)
+    ):
+        scene = rung(load, samples=samples, snr_db=snr_db, trigger_jitter_rms=jitter)
+        assert Inspected(trial(scene, 3)).kept is None
+    for name in ("r_s", "r_p", "c_p"):  # nor of skin that changes
+        scene, skin = rung(load), LOADS[load]
+        moves = falling(skin, name, 0.3)
+        for loads in (moves, [skin, *moves[1:]][::-1], [skin, skin, moves[-1]]):
             assert Inspected(recorded(scene, loads)).kept is None
 
 
-def test_another_pulse_of_the_source_is_no_disturbance():
+def test_another_pulse_of_the_source_is_no_disturbance_and_a_period_at_the_rail_is():
     """Both records show it, and the ratio of their harmonics is as without it."""
-    recording = rung("damp").simulate(1)[TRIAL]
+    recording = trial(rung("damp"), 1)
     later = {name: np.roll(getattr(recording, name), 5000) for name in ("v_th", "v_out")}
     inside = (recording.time > 1.2 * PERIOD) & (recording.time < 1.8 * PERIOD)
     both = {name: np.where(inside, later[name], getattr(recording, name)) for name in later}
     assert Inspected(recording.replace(**both)).kept is None
     # In one record it is a fault; the next period differs as well, and is not good without it.
     assert Inspected(recording.replace(v_out=both["v_out"])).kept is None
-
-
-def test_a_period_that_touches_the_rail_may_be_left_out():
-    recording = rung("damp").simulate(1)[TRIAL]
-    clipped = with_spike(recording, 2, 20.0, width=5e-3)
     assert recording.adc_range is not None
-    high = recording.adc_range[1]
-    railed = Inspected(clipped.replace(v_out=np.minimum(clipped.v_out, high)))
+    clipped = with_spike(recording, 2, 20.0, width=5e-3)
+    railed = Inspected(clipped.replace(v_out=np.minimum(clipped.v_out, recording.adc_range[1])))
     assert railed.kept is not None
     assert preflight(railed) is None
 
@@ -164,6 +145,6 @@ def test_two_periods_of_little_noise_are_fitted_where_aliases_are_small(load):
     """Half of what has aliased is left; above 0.35 of the rate it cost up to 8 standard errors."""
     scene = rung(load, snr_db=80.0, samples=6_667)
     three = etid.identify_driver(rung(load, snr_db=80.0).simulate(0)[CALIBRATION])
-    fits = etid.identify_skins([scene.simulate(seed)[TRIAL] for seed in range(4)], three)
+    fits = etid.identify_skins([trial(scene, seed) for seed in range(4)], three)
     assert set(fits.verdicts) == {"successful"}
-    assert np.abs(off(fits, load)).max() < 5.0  # a bias of two, and noise
+    assert np.abs(off(fits, LOADS[load])).max() < 5.0  # a bias of two, and noise

@@ -12,9 +12,9 @@ from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
 from etid.results.driver import SourceImpedance
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver, loading
+from etid.simulation.transformer import OpenLoad, ResistorLoad, TransformerDriver, loading
+from tests.skins import DRY, off
 
-DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DRIFT = 0.01
 FITS = 60
 DRIVERS = 200
@@ -52,8 +52,7 @@ def test_standard_errors_hold_what_the_driver_drifts_by(driver, method):
     fits = etid.identify_skins(recordings, driver, method=method)
     # One in 6000 is off by chance; that a driver drifts as it may is no verdict.
     assert fits.counts() == {"successful": FITS}
-    truth = np.array([DRY.r_s, DRY.r_p, DRY.c_p])
-    scaled = (np.asarray(fits.circuit.values()) - truth) / np.asarray(fits.stderr.values())
+    scaled = off(fits)
     # 95 % of 60 less three standard deviations; a scatter of sqrt(1/120) around 1, and R_s, R_p
     # and C_p are seen to be 0.7 to 1.0 here.
     assert (np.mean(np.abs(scaled) < 1.96, axis=0) > 0.86).all()
@@ -83,8 +82,7 @@ def test_standard_errors_hold_what_the_parts_of_the_driver_drift_by(driver, name
     assert fits.counts().get("changed", 0) < 3
     good = fits.successful()
     assert len(good) > 0.9 * DRIVERS
-    error = np.asarray(good.circuit.values()) - np.array(dataclasses.astuple(LOADS[name]))
-    covered = np.mean(np.abs(error / np.asarray(good.stderr.values())) < 1.96, axis=0)
+    covered = np.mean(np.abs(off(good, LOADS[name])) < 1.96, axis=0)
     # 95 % of 189 less three standard deviations; R_p was found in 92 to 94 %, the others in more.
     assert (covered > 0.90).all(), covered
 

@@ -28,10 +28,9 @@ from etid.online.tick import (
     after_pulse,
     anew,
     attempt,
-    predicted,
     suspicion,
 )
-from etid.results.verdicts import RESULTS, first_verdict, verdict_names, verdicts_of
+from etid.results.verdicts import RESULTS, verdict_names, verdicts_of
 
 NUMBER, LIMIT = 77, 10.0
 POWERS = np.array([1.0, -1.0])  # of a resistor and of a capacitor
@@ -56,6 +55,7 @@ class Case(NamedTuple):
     gain: bool
 
 
+USUAL = Case(True, False, False, True, "good", False, 0, False, False, False)
 CASES = [
     Case(*one)
     for one in itertools.product(
@@ -206,130 +206,105 @@ def test_the_state_after_a_pulse_follows_its_rules_in_every_case():
     assert not wrong, (len(wrong), wrong[:3])
 
 
-def test_what_is_known_after_a_walk_is_the_sum_of_covariances():
-    found = predicted(jnp.asarray(BEFORE), jnp.asarray(0.3))
-    inverse = np.linalg.inv(np.linalg.inv(BEFORE) + 0.3**2 * np.eye(2))
-    np.testing.assert_allclose(found, inverse, rtol=1e-12)
+suspected_of = jax.jit(suspicion)
 
 
-@pytest.mark.parametrize("limit", [0.5, 2.0])
-def test_a_pulse_is_suspected_by_the_distance_from_its_prediction(limit):
+def test_a_pulse_is_suspected_by_the_distance_from_its_prediction():
     """T = δᵀ (Λ⁻¹ + cov)⁻¹ δ of the fit of the pulse alone, δ = δ₊ + cov Λ δ₊."""
-    of = Case(True, True, True, True, "good", False, 0, False, False, False)
-    state, _, before, found, *_ = electrode(of)
+    state, _, before, found, *_ = electrode(USUAL)
     off = (found.own - state["own"])[:2]
     alone = off + found.spread @ before @ off
     statistic = alone @ np.linalg.inv(np.linalg.inv(before) + found.spread) @ alone
-
-    def suspected(running, good, part):
-        pulses = {"pulses": 12 if running else 0}
-        of = ElectrodeState(**jax.tree.map(jnp.asarray, state | pulses))
-        fit = found._replace(result=GOOD if good else BAD)
-        fit = jax.tree.map(jnp.asarray, fit)
-        arguments = jnp.asarray(before), jnp.array([0.6, 0.8]), jnp.asarray(part * statistic)
-        return jax.jit(suspicion)(of, fit, *arguments)
-
-    assert bool(suspected(True, True, limit).jump) == (limit < 1)
-    assert bool(suspected(True, False, limit).jump)
-    assert not bool(suspected(True, False, limit).drift)
-    assert not bool(suspected(False, True, limit).jump)
-    assert not bool(suspected(False, False, limit).drift)
+    for running, good, part, jump, drift in (
+        (True, True, 0.5, True, None),
+        (True, True, 2.0, False, None),
+        (True, False, 0.5, True, False),
+        (True, False, 2.0, True, False),
+        (False, True, 0.5, False, None),
+        (False, False, 0.5, False, False),
+    ):
+        of = ElectrodeState(**jax.tree.map(jnp.asarray, state | {"pulses": 12 if running else 0}))
+        fit = jax.tree.map(jnp.asarray, found._replace(result=GOOD if good else BAD))
+        common, limit = jnp.array([0.6, 0.8]), jnp.asarray(part * statistic)
+        seen = suspected_of(of, fit, jnp.asarray(before), common, limit)
+        assert bool(seen.jump) == jump, (running, good, part)
+        assert drift is None or bool(seen.drift) == drift, (running, good, part)
 
 
 class Minimum(NamedTuple):
     """What is found at the minimum of a pulse."""
 
     squares: Any
-    curvature: Any
+    curvature: Any = jnp.array([[50.0, 4.0, 3.0], [4.0, 40.0, -2.0], [3.0, -2.0, 9.0]])
 
 
-CURVED = np.array([[50.0, 4.0, 3.0], [4.0, 40.0, -2.0], [3.0, -2.0, 9.0]])
-
-
-@pytest.mark.parametrize(
-    ("bad", "own", "decrement", "squares", "verdict"),
-    [
-        (SUCCESSFUL, 0.1, 0.1, 3.0, SUCCESSFUL),
-        (RESULTS.saturated, 0.1, 0.1, 3.0, RESULTS.saturated),
-        (RESULTS.saturated, np.nan, 5.0, 9e9, RESULTS.saturated),
-        (SUCCESSFUL, np.nan, 5.0, 9e9, RESULTS.nonphysical),
-        (SUCCESSFUL, 0.1, 5.0, 9e9, MAX_STEPS_REACHED),
-        (SUCCESSFUL, 0.1, np.nan, 3.0, MAX_STEPS_REACHED),
-        (SUCCESSFUL, 0.1, 0.1, 9e9, RESULTS.misfit),
-        (SUCCESSFUL, 1.7, 0.1, 3.0, RESULTS.misfit),
-        (SUCCESSFUL, -1.7, 0.1, 3.0, RESULTS.misfit),
-        (SUCCESSFUL, 1.4, 0.1, 3.0, SUCCESSFUL),
-    ],
-)
-def test_the_worst_that_a_pulse_shows_is_its_verdict(
-    monkeypatch, bad, own, decrement, squares, verdict
-):
+def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
     """Bad samples, then no number, then no minimum, then a misfit or a delay out of its range."""
-    logs = np.array([1.0, 2.0, own])
-    at = Minimum(jnp.asarray(squares), jnp.asarray(CURVED))
-    monkeypatch.setattr(
-        "etid.online.tick.minimum",
-        lambda *_: (jnp.asarray(logs), at, jnp.asarray(decrement), jnp.zeros(6)),
-    )
-    nothing = GainScore(jnp.zeros(3), jnp.zeros(2))
-    monkeypatch.setattr(GainScore, "of", lambda *_: nothing)
-    monkeypatch.setattr("etid.online.tick.Pulse", lambda *_: None)
+    rows = [  # verdict on the samples, delay, decrement, squares, verdict
+        ("successful", 0.1, 0.1, 3.0, "successful"),
+        ("saturated", 0.1, 0.1, 3.0, "saturated"),
+        ("saturated", np.nan, 5.0, 9e9, "saturated"),
+        ("successful", np.nan, 5.0, 9e9, "nonphysical"),
+        ("successful", 0.1, 5.0, 9e9, "max_steps_reached"),
+        ("successful", 0.1, np.nan, 3.0, "max_steps_reached"),
+        ("successful", 0.1, 0.1, 9e9, "misfit"),
+        ("successful", 1.7, 0.1, 3.0, "misfit"),
+        ("successful", -1.7, 0.1, 3.0, "misfit"),
+        ("successful", 1.4, 0.1, 3.0, "successful"),
+    ]
+    bad, delay, decrement, squares, verdict = map(np.array, zip(*rows, strict=True))
     weight, gain = np.array([3.0, 2.0, 0.0]), np.array([1 + 1j, 2j, 5.0])
-    measured = Measured(
-        gain=jnp.asarray(gain),
-        variance=jnp.asarray(0.01),
-        weight=jnp.asarray(weight),
-        level=jnp.asarray(0.5),
-        amplitude=jnp.asarray(1.0),
-        offset=jnp.asarray(0.0),
-        steady=jnp.asarray(True),
-        shown=jnp.asarray(4.0),
-        bad=first_verdict((jnp.asarray(True), bad)),
-    )
-    monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
+    nothing, zero = GainScore(jnp.zeros(3), jnp.zeros(2)), jnp.asarray(0.0)
     model = object.__new__(GainModel)  # only these two fields are read
     object.__setattr__(model, "bands", types.SimpleNamespace(weight=jnp.asarray(weight)))
     object.__setattr__(model, "noise_freedom", jnp.asarray(1000.0))
-    start = LoadUnknowns.of(jnp.asarray(logs))
-    none = jnp.zeros(3, complex)
-    expected = Expected(none, jnp.zeros((2, 3), complex), none)
-    found = attempt(model, measured, start, expected, jnp.zeros(2), jnp.zeros((2, 2)))
-    assert bool(found.result == verdict)
+    monkeypatch.setattr(GainScore, "of", lambda *_: nothing)
+    monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
+    monkeypatch.setattr("etid.online.tick.Pulse", lambda *_: None)
+
+    @jax.jit
+    @jax.vmap
+    def attempted(bad, delay, decrement, squares):
+        logs = jnp.concatenate([jnp.array([1.0, 2.0]), delay[None]])
+        found = logs, Minimum(squares), decrement, jnp.zeros(6)
+        monkeypatch.setattr("etid.online.tick.minimum", lambda *_: found)
+        variance, level, one = jnp.asarray(0.01), jnp.asarray(0.5), jnp.asarray(1.0)
+        measured = Measured(
+            jnp.asarray(gain), variance, jnp.asarray(weight), level, one, zero, one > 0, one, bad
+        )
+        none = jnp.zeros(3, complex)
+        expected, start = Expected(none, jnp.zeros((2, 3), complex), none), LoadUnknowns.of(logs)
+        return attempt(model, measured, start, expected, jnp.zeros(2), jnp.zeros((2, 2)))
+
+    numbers = map(jnp.asarray, (delay, decrement, squares))
+    found = attempted(jax.tree.map(jnp.asarray, verdicts_of(bad)), *numbers)
+    assert verdict_names(found.result).tolist() == verdict.tolist()
     # Two bands have two numbers each, and three are fitted.
     np.testing.assert_allclose(found.chi2, squares / (2 * 2 - 3))
     power = (weight * abs(gain) ** 2).sum()
     np.testing.assert_allclose(found.rrse, np.sqrt(squares * 0.01 / power))
-    told = np.linalg.inv(np.linalg.inv(CURVED)[:2, :2])  # the delay is free
-    np.testing.assert_allclose(found.information, told)
-    np.testing.assert_allclose(found.spread, np.linalg.inv(told))
+    spread = np.linalg.inv(Minimum(0.0).curvature)[:2, :2]  # the delay is free
+    every = (len(rows), 1, 1)
+    np.testing.assert_allclose(found.spread, np.tile(spread, every))
+    np.testing.assert_allclose(found.information, np.tile(np.linalg.inv(spread), every))
 
 
-@pytest.mark.parametrize(
-    ("score", "moved", "wrong"),
-    [
+def test_a_gain_is_wrong_if_all_noise_and_one_that_does_not_matter_are_less():
+    """The variance is 16 by the pulses and 3² by the calibrations: a standard deviation of 5."""
+    limit = MOVED / (SEEN_GAIN * 5) * 16
+    for score, moved, wrong in (
         (SEEN_GAIN * 5.01, [0.0, 9.0], True),
         (-SEEN_GAIN * 5.01, [-9.0, 0.0], True),
         (SEEN_GAIN * 4.99, [0.0, 9.0], False),
-        (SEEN_GAIN * 10, [0.0, 1.01 * MOVED / (SEEN_GAIN * 5) * 16], True),
-        (SEEN_GAIN * 10, [0.0, 0.99 * MOVED / (SEEN_GAIN * 5) * 16], False),
+        (SEEN_GAIN * 10, [0.0, 1.01 * limit], True),
+        (SEEN_GAIN * 10, [0.0, 0.99 * limit], False),
         (np.nan, [0.0, 9.0], False),
-    ],
-)
-def test_a_gain_is_wrong_if_all_noise_and_one_that_does_not_matter_are_less(score, moved, wrong):
-    """The variance is 16 by the pulses and 3² by the calibrations: a standard deviation of 5."""
-    found = GainScore(jnp.array([score, 16.0, 3.0]), jnp.array(moved))
-    assert bool(found.wrong()) == wrong
+    ):
+        found = GainScore(jnp.array([score, 16.0, 3.0]), jnp.array(moved))
+        assert bool(found.wrong()) == wrong
 
 
 # --- changes --------------------------------------------------------------------------------------
-
-
-def test_an_element_that_changes_alone_is_named_however_well_the_others_are_known():
-    """(W e_i)_j² / W_jj is largest for j = i, by Cauchy and Schwarz."""
-    root = np.random.default_rng(0).normal(size=(3, 3)) * [[1.0], [30.0], [0.1]]
-    cov = jnp.asarray(root @ root.T)
-    for number, d in enumerate(jnp.eye(3)):
-        assert int(alarms.Innovation(d, jnp.linalg.inv(cov), cov).element()) == number
 
 
 def test_an_innovation_and_its_moving_mean_are_those_of_their_formulas():
@@ -347,15 +322,25 @@ def test_an_innovation_and_its_moving_mean_are_those_of_their_formulas():
     np.testing.assert_allclose(moving.d, 0.9 * mean + 0.1 * d)
     np.testing.assert_allclose(moving.cov, 0.81 * BEFORE / 1e4 + 0.01 * cov)
     np.testing.assert_allclose(moving.weight, np.linalg.inv(moving.cov))
+    # An element that changes alone is named however well the others are known: (W e_i)_j² / W_jj is
+    # largest for j = i, by Cauchy and Schwarz.
+    root = np.random.default_rng(0).normal(size=(3, 3)) * [[1.0], [30.0], [0.1]]
+    cov = jnp.asarray(root @ root.T)
+    for number, d in enumerate(jnp.eye(3)):
+        assert int(alarms.Innovation(d, jnp.linalg.inv(cov), cov).element()) == number
 
 
 LANES = 20
 SURE = alarms.DRIVER * 1.709 / np.sqrt(LANES) - 1.282  # nine tenths of z beyond it: the driver
 
 
-@pytest.mark.parametrize(
-    ("z", "jumps", "counted", "expected"),
-    [
+driver_changed = jax.jit(alarms.driver_change)
+
+
+@pytest.mark.parametrize("test", [0, 1])
+def test_the_driver_has_changed_if_most_electrodes_move_one_way(test):
+    """Those that do not count may move or be anything; one in ten may move the other way."""
+    for z, jumps, counted, expected in (
         (0.0, 0, LANES, False),
         (SURE + 0.01, 0, LANES, True),
         (SURE - 0.01, 0, LANES, False),
@@ -369,35 +354,28 @@ SURE = alarms.DRIVER * 1.709 / np.sqrt(LANES) - 1.282  # nine tenths of z beyond
         (99.0, 0, alarms.COMMON, True),
         (99.0, 0, alarms.COMMON - 1, False),
         (99.0, 0, 0, False),
-    ],
-)
-@pytest.mark.parametrize("test", [0, 1])
-def test_the_driver_has_changed_if_most_electrodes_move_one_way(z, jumps, counted, expected, test):
-    """Those that do not count may move or be anything; one in ten may move the other way."""
-    values = np.zeros((2, LANES))
-    values[test] = z
-    values[test, :1] = -z
-    values[:, counted:] = -99.0
-    values[test, counted + 1 :] = np.nan
-    jumped, counts = np.arange(LANES) < jumps, np.arange(LANES) < counted
-    jumped[counted:] = True
-    running = np.arange(LANES) < 2 * counted - 1  # those that count are more than half of them
-    found = alarms.driver_change(*map(jnp.asarray, (jumped, values, counts, running)))
-    assert bool(found) == expected
-
-
-def test_a_few_electrodes_in_trouble_are_not_the_driver_while_the_others_change_their_amplitude():
+    ):
+        values = np.zeros((2, LANES))
+        values[test] = z
+        values[test, :1] = -z
+        values[:, counted:] = -99.0
+        values[test, counted + 1 :] = np.nan
+        jumped, counts = np.arange(LANES) < jumps, np.arange(LANES) < counted
+        jumped[counted:] = True
+        running = np.arange(LANES) < 2 * counted - 1  # those that count are more than half of them
+        found = driver_changed(*map(jnp.asarray, (jumped, values, counts, running)))
+        assert bool(found) == expected, (z, jumps, counted)
+    # A few electrodes in trouble are not the driver while the others change their amplitude.
     counts, running = np.arange(LANES) < alarms.COMMON, np.arange(LANES) < 2 * alarms.COMMON
     values = np.where(counts, 99.0, 0.0) * np.ones((2, 1))
     for jumped in (counts, ~counts):
-        found = alarms.driver_change(*map(jnp.asarray, (jumped, values, counts, running)))
-        assert not bool(found)
+        assert not bool(driver_changed(*map(jnp.asarray, (jumped, values, counts, running))))
 
 
 def state_of(**fields: Any) -> TrackerState:
     """A state after pulse 100 of as many electrodes as a field has."""
     count = max(len(value) for value in fields.values())
-    one = electrode(Case(True, False, False, True, "good", False, 0, False, False, False))[0]
+    one = electrode(USUAL)[0]
     lanes: dict[str, Any] = {
         name: jnp.asarray(np.stack([value] * count))
         for name, value in one.items()
@@ -518,30 +496,23 @@ def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch
     assert verdict_names(found.bad).tolist() == verdict.tolist()
 
 
-@pytest.mark.parametrize(
-    ("spread", "result", "verdict"),
-    [
-        ([0.5, 0.9], GOOD, "successful"),
-        ([0.5, 1.1], GOOD, "insensitive"),
-        ([1.1, 0.5], GOOD, "insensitive"),
-        ([np.nan, 0.5], GOOD, "insensitive"),
-        ([1.1, 0.5], BAD, "misfit"),
-    ],
-)
-def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(
-    monkeypatch, spread, result, verdict
-):
-    zero, two = jnp.zeros(()), jnp.zeros(2)
+def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(monkeypatch):
+    zero, two, wave = jnp.zeros(()), jnp.zeros(2), jnp.zeros(3, complex)
     monkeypatch.setattr(tick, "nearest_delay", lambda *_: (zero, zero))
     monkeypatch.setattr(tick, "searched", lambda *_: jnp.zeros(3))
     for name in ("departure", "undelayed", "expected"):
-        monkeypatch.setattr(GainModel, name, lambda *_: jnp.zeros(3, complex))
-    fit = ATTEMPT(
-        jnp.zeros(3), two, jnp.diag(jnp.array(spread)), zero, zero,
-        first_verdict((jnp.asarray(True), result)), GainScore(jnp.zeros(3), two),
-    )  # fmt: skip
-    monkeypatch.setattr(tick, "attempt", lambda *_: fit)
-    measured = MEASURED(jnp.zeros(3, complex), zero, jnp.ones(3), *[zero] * 6)
-    model = object.__new__(GainModel)
-    found = anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two)
-    assert str(verdict_names(found.result)) == verdict
+        monkeypatch.setattr(GainModel, name, lambda *_: wave)
+    measured, model = MEASURED(wave, zero, jnp.ones(3), *[zero] * 6), object.__new__(GainModel)
+    score = GainScore(jnp.zeros(3), two)
+
+    @jax.jit
+    @jax.vmap
+    def alone(spread, result):
+        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, score)
+        monkeypatch.setattr(tick, "attempt", lambda *_: fit)
+        return anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two).result
+
+    spread = jnp.array([[0.5, 0.9], [0.5, 1.1], [1.1, 0.5], [np.nan, 0.5], [1.1, 0.5]])
+    results = verdicts_of(np.array(["successful"] * 4 + ["misfit"]))
+    found = verdict_names(alone(spread, jax.tree.map(jnp.asarray, results)))
+    assert found.tolist() == ["successful", *["insensitive"] * 3, "misfit"]

@@ -9,6 +9,7 @@ from benchmarks.perturbed_study import all_records, both, undisturbed
 from etid.estimators.lanes import Harmonics
 from etid.recordings.preflight import Inspected
 from etid.signals.noise import coloured, corner, noise_std
+from tests.skins import off
 
 RATE, SIGMA = 200e3, 0.02
 OF_RECORD = {3: 10_000, 2: 6667, 10: 33_333}
@@ -64,8 +65,7 @@ def test_a_fit_weighs_flicker_noise():
     # The periods of such noise differ: one of ten records is `changed`.
     assert set(fits[1].verdicts) <= {"successful", "changed"}
     truth = np.array([study.truths[one.path].low for one in study.trials])
-    errors = np.asarray(fits[1].circuit.values()) - truth
-    assert (np.abs(errors) < 4 * np.asarray(fits[1].stderr.values())).all()
+    assert (np.abs(off(fits[1], truth)) < 4).all()
     ratio = variances[1][:10] / variances[0][:10]
     expected = 1 + 1e4 / (60 * np.arange(1, 11))
     # White noise is known to 2 %, the corner to a quarter.

@@ -5,16 +5,8 @@ import pytest
 
 import etid
 from etid.recordings.remarks import Remark
-from tests.test_driver_and_current import (
-    DAMP,
-    LATE,
-    SKIN,
-    WITHIN,
-    late_record,
-    off,
-    relative,
-    scene,
-)
+from tests.skins import DAMP, DRY, off, relative
+from tests.test_driver_and_current import LATE, WITHIN, late_record, scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("run_as_for_users")]
 
@@ -131,14 +123,13 @@ def test_the_tolerance_of_the_known_resistor_is_what_the_current_leaves_of_it(pa
 def test_intervals_of_joint_estimates_are_true():
     """Dry skin with an unloaded record for each recording, and damp skin with one for all."""
     z, draws = [], 12
-    for circuit, current_snr_db, shared_v_th in ((SKIN, 40.0, False), (DAMP, 30.0, True)):
+    for circuit, current_snr_db, shared_v_th in ((DRY, 40.0, False), (DAMP, 30.0, True)):
         of = scene(circuit, current_snr_db=current_snr_db, shared_v_th=shared_v_th)
         for seed in range(draws):
             fits = etid.identify_jointly(of.simulate(seed + 2000)).fits
             assert set(fits.verdicts) <= {"successful", "inconsistent", "changed"}, seed
             if (fits.verdicts == "successful").all():
-                off = [values(fit) - np.asarray(circuit.values()) for fit in fits]
-                z.append(np.stack(off) / np.stack([errors(fit) for fit in fits]))
+                z.append(off(fits, circuit))
     assert len(z) >= 2 * draws - 2
     # Two fits of a draw share its driver: 24 squares have a mean that is known to 29 %, and these
     # are three of that.

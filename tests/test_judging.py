@@ -81,15 +81,6 @@ def test_what_a_residual_may_leave_unexplained_depends_on_the_method():
 
 
 @pytest.mark.parametrize(
-    ("delay", "expected"), [(1.05, True), (-1.05, True), (0.95, False), (-0.95, False)]
-)
-def test_a_trigger_that_is_more_than_a_sample_late_or_early_is_a_misfit(delay, expected):
-    of = estimate(delay=delay)
-    assert bool(too_late(of)) is expected
-    assert name(of) == ("misfit" if expected else "successful")
-
-
-@pytest.mark.parametrize(
     ("change", "expected"),
     [
         ({}, "successful"),
@@ -105,29 +96,43 @@ def test_a_trigger_that_is_more_than_a_sample_late_or_early_is_a_misfit(delay, e
         ({"relative": (0.01, np.nan, 0.01)}, "insensitive"),
         # Where noise hides C_p a fit may take it to 1e-190 F, and its derivative underflows.
         ({"parameters": (10.0, 12.0, -437.0), "relative": (0.01, 0.01, 1e6)}, "insensitive"),
+        # A trigger that is more than a sample late or early.
+        ({"delay": 1.05}, "misfit"),
+        ({"delay": -1.05}, "misfit"),
+        ({"delay": 0.95}, "successful"),
+        ({"delay": -0.95}, "successful"),
     ],
 )
 def test_every_reason_has_its_verdict(change, expected):
-    assert name(estimate(**change)) == expected
+    of = estimate(**change)
+    assert name(of) == expected
+    assert bool(too_late(of)) is ("delay" in change and expected == "misfit")
 
 
-@pytest.mark.parametrize(("alpha", "expected"), [(1.02, "successful"), (1.1, "nonphysical")])
-def test_an_exponent_far_above_one_is_no_circuit(alpha, expected):
-    """Of 1 % standard error: what a passive network cannot do is then no accident."""
-    of = estimate()
-    logs, cov = jnp.log(jnp.array([33e3, 186e3, 22e-6, alpha])), 1e-4 * jnp.eye(4)
-    of = Estimate(**{**vars(of), "parameters": logs, "cov": cov, "shared_cov": 0 * cov})
-    assert judged(of, etid.SkinCole(), SUCCESSFUL, "a method").verdict == expected
+@pytest.mark.parametrize(
+    ("chi2", "driver", "later", "expected"),
+    [
+        (1.0, "successful", False, "successful"),
+        (1.0, "successful", True, "biased"),  # a later test overrules success only
+        (9.0, "successful", True, "misfit"),
+        (9.0, "successful", False, "misfit"),
+        (1.0, "nonphysical", False, "driver_failed"),  # a failed driver comes last
+        (9.0, "nonphysical", False, "misfit"),
+    ],
+)
+def test_of_several_reasons_one_is_the_verdict(chi2, driver, later, expected):
+    fit = judged(estimate(chi2=chi2, rrse=0.1), etid.SkinRC(), verdict(driver), "a method")
+    assert unless(fit, jnp.asarray(later), RESULTS.biased).verdict == expected
 
 
-@pytest.mark.parametrize("seen", [*itertools.product([True, False], repeat=3)])
-def test_hum_and_a_falling_or_late_resistance_are_remarks(seen):
+def test_hum_and_a_falling_or_late_resistance_are_remarks():
     names = Remark.mains_hum, Remark.falls_with_current, Remark.follows_late
-    expected = sum(name for name, one in zip(names, seen, strict=True) if one)
-    hum, falls, late = map(jnp.asarray, seen)
-    assert int(remarks(hum, falls, late)) == expected
-    fit = judged(estimate(hum=hum, falls=falls, late=late), etid.SkinRC(), SUCCESSFUL, "a method")
-    assert int(fit.remarks) == expected
+    for seen in itertools.product([True, False], repeat=3):
+        expected = sum(name for name, one in zip(names, seen, strict=True) if one)
+        hum, falls, late = map(jnp.asarray, seen)
+        assert int(remarks(hum, falls, late)) == expected
+        of = estimate(hum=hum, falls=falls, late=late)
+        assert int(judged(of, etid.SkinRC(), SUCCESSFUL, "a method").remarks) == expected
 
 
 def test_the_distance_to_the_minimum_is_in_standard_errors():
@@ -137,12 +142,6 @@ def test_the_distance_to_the_minimum_is_in_standard_errors():
     np.testing.assert_allclose(distance_to_minimum(equations), y @ matrix @ y, rtol=1e-12)
 
 
-def test_a_failed_driver_comes_last():
-    failed = verdict("nonphysical")
-    assert name(estimate(), failed) == "driver_failed"
-    assert name(estimate(chi2=9.0, rrse=0.1), failed) == "misfit"
-
-
 def test_logarithms_become_elements_and_their_errors():
     of = estimate(relative=(0.01, 0.02, 0.03))
     fit = judged(of, etid.SkinRC(), SUCCESSFUL, "a method")
@@ -150,17 +149,8 @@ def test_logarithms_become_elements_and_their_errors():
     np.testing.assert_allclose(fit.circuit.values(), values, rtol=1e-12)
     np.testing.assert_allclose(fit.stderr.values(), values * [0.01, 0.02, 0.03], rtol=1e-12)
     np.testing.assert_allclose(fit.shared_cov, 0.25 * fit.cov, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("chi2", "bad", "verdict"),
-    [
-        (1.0, True, "biased"),
-        (1.0, False, "successful"),
-        (9.0, True, "misfit"),
-        (9.0, False, "misfit"),
-    ],
-)
-def test_a_later_test_overrules_success_only(chi2, bad, verdict):
-    fit = judged(estimate(chi2=chi2, rrse=0.1), etid.SkinRC(), SUCCESSFUL, "a method")
-    assert unless(fit, jnp.asarray(bad), RESULTS.biased).verdict == verdict
+    # An exponent far above one is no circuit: of 1 % standard error, it is no accident.
+    for alpha, expected in ((1.02, "successful"), (1.1, "nonphysical")):
+        logs, cov = jnp.log(jnp.array([33e3, 186e3, 22e-6, alpha])), 1e-4 * jnp.eye(4)
+        of = Estimate(**{**vars(of), "parameters": logs, "cov": cov, "shared_cov": 0 * cov})
+        assert judged(of, etid.SkinCole(), SUCCESSFUL, "a method").verdict == expected

@@ -1,12 +1,9 @@
 """Mains hum costs nothing but the harmonics on which it falls, and a fit says that it was there."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 import etid
-from etid.estimators.judgement import MISFIT_CHI2
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Samples
 from etid.recordings.remarks import Remark
@@ -35,11 +32,7 @@ def hummed(recording, frequency, volts, seed=0, signals=("v_th", "v_out")):
         )
         codes = np.rint(of.stored + added / SCALE / of.conversion)
         samples[name] = Samples(codes.astype(of.stored.dtype), of.conversion, of.offset)
-    fields = {
-        field.name: getattr(recording, field.name)
-        for field in dataclasses.fields(recording.metadata)
-    }
-    return etid.Recording(samples["v_th"], samples["v_out"], **fields)
+    return recording.replace(**samples)
 
 
 def study_of(**settings):
@@ -132,29 +125,14 @@ def test_hum_in_a_batch_costs_the_other_recordings_nothing(records, quiet, caplo
     np.testing.assert_allclose(np.asarray(fits.circuit.r_p)[1], fit.circuit.r_p, rtol=2e-3)
 
 
-def louder(recording, factor):
-    """The recording with this gain of v_out."""
-    of = recording.samples["v_out"]
-    return recording.replace(v_out=Samples(of.stored, factor * of.conversion))
-
-
 def test_a_wrong_gain_is_no_hum(records, quiet):
     """It is more on the low harmonics than noise explains, as hum is, but on all alike."""
-    fit = etid.identify_skin(louder(records[1], 1.01), quiet[0], throw=False)
+    of = records[1].samples["v_out"]
+    louder = records[1].replace(v_out=Samples(of.stored, 1.01 * of.conversion))
+    fit = etid.identify_skin(louder, quiet[0], throw=False)
     assert fit.verdict == "inconsistent"
     kept_numbers.check("wrong_gain", kept_numbers.of_fit(fit))
     assert int(fit.remarks) == 0
-
-
-def test_a_wrong_gain_is_a_misfit_where_chi2_does_not_show_it():
-    """At 40 dB one of 2 % makes R_p wrong by half; its own standard error is 0.17 %."""
-    calibration, skin = study_of(snr_db=40.0).values()
-    driver = etid.identify_driver(calibration)
-    assert etid.identify_skin(skin, driver).verdict == "successful"
-    fit = etid.identify_skin(louder(skin, 1.02), driver, throw=False)
-    kept_numbers.check("wrong_gain_noisy", kept_numbers.of_fit(fit))
-    assert fit.verdict == "misfit"
-    assert fit.chi2 < MISFIT_CHI2
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +55,7 @@ def fit(scene, kind, seed, circuit: etid.AbstractCircuit = SKIN, gains=(1.0, 1.0
     load = Load.behind(known, circuit, blank, rate, None, outputs)
     z = known.mean + root(known.cov) @ rng.standard_normal(known.mean.size)
     delays = 0.1 * rng.standard_normal(count)
-    gain = np.asarray(load.predicted(jnp.concatenate([circuit.log_values(), delays, z])))
+    gain = np.asarray(predicted(load, jnp.concatenate([circuit.log_values(), delays, z])))
     clean_x, of_voltage = np.asarray(spectrum.x), float(spectrum.variance_y.mean())
     clean = gain * clean_x
     size = np.mean(np.abs(clean) ** 2, axis=1)
@@ -76,13 +77,19 @@ def fit(scene, kind, seed, circuit: etid.AbstractCircuit = SKIN, gains=(1.0, 1.0
     return new_data.fit(outputs, known, measured, others, rate)
 
 
+predicted = eqx.filter_jit(Load.predicted)
+
+
 def test_it_is_one_short_file():
     assert len(inspect.getsource(new_data).splitlines()) <= 60
 
 
-@pytest.mark.parametrize(
+EACH = pytest.mark.parametrize(
     "kind", [pytest.param("two currents", marks=pytest.mark.slow), "known in series"]
 )
+
+
+@EACH
 def test_its_standard_errors_are_those_of_its_estimates(scene, kind):
     fits = [fit(scene, kind, seed) for seed in range(DRAWS)]
     off = [np.log(np.asarray(of.circuit.values()) / np.asarray(SKIN.values())) for of in fits]
@@ -93,7 +100,7 @@ def test_its_standard_errors_are_those_of_its_estimates(scene, kind):
     assert sum(str(of.verdict) == "successful" for of in fits) > 0.95 * DRAWS
 
 
-@pytest.mark.parametrize("kind", ["two currents", "known in series"])
+@EACH
 def test_its_score_tests_see_another_circuit_and_another_scale(scene, kind):
     assert fit(scene, kind, 1, COLE).verdict == "misfit"
     for number in range(1, KINDS[kind].count):

@@ -12,21 +12,8 @@ import pytest
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 
-def misra1a(b, x):
-    return b[0] * (1 - jnp.exp(-b[1] * x))
-
-
-def chwirut(b, x):
-    return jnp.exp(-b[0] * x) / (b[1] + b[2] * x)
-
-
-def lanczos(b, x):
-    return b[0] * jnp.exp(-b[1] * x) + b[2] * jnp.exp(-b[3] * x) + b[4] * jnp.exp(-b[5] * x)
-
-
 def gauss(b, x):
-    first = b[2] * jnp.exp(-(((x - b[3]) / b[4]) ** 2))
-    second = b[5] * jnp.exp(-(((x - b[6]) / b[7]) ** 2))
+    first, second = (b[k] * jnp.exp(-(((x - b[k + 1]) / b[k + 2]) ** 2)) for k in (2, 5))
     return b[0] * jnp.exp(-b[1] * x) + first + second
 
 
@@ -37,68 +24,35 @@ def enso(b, x):
     return b[0] + cycle(12.0, b[1], b[2]) + cycle(b[3], b[4], b[5]) + cycle(b[6], b[7], b[8])
 
 
-def kirby2(b, x):
-    return (b[0] + b[1] * x + b[2] * x**2) / (1 + b[3] * x + b[4] * x**2)
+def ratio(degree):
+    """A ratio of polynomials, of which that below has no constant."""
 
+    def model(b, x):
+        above = sum(b[k] * x**k for k in range(degree + 1))
+        return above / (1 + sum(b[degree + k] * x**k for k in range(1, degree + 1)))
 
-def cubic_ratio(b, x):
-    numerator = b[0] + b[1] * x + b[2] * x**2 + b[3] * x**3
-    return numerator / (1 + b[4] * x + b[5] * x**2 + b[6] * x**3)
-
-
-def mgh09(b, x):
-    return b[0] * (x**2 + x * b[1]) / (x**2 + x * b[2] + b[3])
-
-
-def mgh10(b, x):
-    return b[0] * jnp.exp(b[1] / (x + b[2]))
-
-
-def mgh17(b, x):
-    return b[0] + b[1] * jnp.exp(-x * b[3]) + b[2] * jnp.exp(-x * b[4])
-
-
-def nelson(b, x):  # of log[y]
-    return b[0] - b[1] * x[0] * jnp.exp(-b[2] * x[1])
-
-
-def rat43(b, x):
-    return b[0] / (1 + jnp.exp(b[1] - b[2] * x)) ** (1 / b[3])
-
-
-def roszman1(b, x):
-    return b[0] - b[1] * x - jnp.arctan(b[2] / (x - b[3])) / jnp.pi
-
-
-def eckerle4(b, x):
-    return b[0] / b[1] * jnp.exp(-0.5 * ((x - b[2]) / b[1]) ** 2)
-
-
-def bennett5(b, x):
-    return b[0] * (b[1] + x) ** (-1 / b[2])
+    return model
 
 
 MODELS = {
-    "Bennett5": bennett5,
-    "BoxBOD": misra1a,
-    "Chwirut1": chwirut,
+    "Bennett5": lambda b, x: b[0] * (b[1] + x) ** (-1 / b[2]),
+    "BoxBOD": lambda b, x: b[0] * (1 - jnp.exp(-b[1] * x)),
+    "Chwirut1": lambda b, x: jnp.exp(-b[0] * x) / (b[1] + b[2] * x),
     "ENSO": enso,
-    "Eckerle4": eckerle4,
+    "Eckerle4": lambda b, x: b[0] / b[1] * jnp.exp(-0.5 * ((x - b[2]) / b[1]) ** 2),
     "Gauss1": gauss,
     "Gauss3": gauss,
-    "Hahn1": cubic_ratio,
-    "Kirby2": kirby2,
-    "Lanczos1": lanczos,
-    "Lanczos3": lanczos,
-    "MGH09": mgh09,
-    "MGH10": mgh10,
-    "MGH17": mgh17,
-    "Misra1a": misra1a,
-    "Nelson": nelson,
-    "Rat43": rat43,
-    "Roszman1": roszman1,
-    "Thurber": cubic_ratio,
+    "Hahn1": ratio(3),
+    "Kirby2": ratio(2),
+    "Lanczos1": lambda b, x: sum(b[k] * jnp.exp(-b[k + 1] * x) for k in (0, 2, 4)),
+    "MGH09": lambda b, x: b[0] * (x**2 + x * b[1]) / (x**2 + x * b[2] + b[3]),
+    "MGH10": lambda b, x: b[0] * jnp.exp(b[1] / (x + b[2])),
+    "MGH17": lambda b, x: b[0] + b[1] * jnp.exp(-x * b[3]) + b[2] * jnp.exp(-x * b[4]),
+    "Nelson": lambda b, x: b[0] - b[1] * x[0] * jnp.exp(-b[2] * x[1]),  # of log[y]
+    "Rat43": lambda b, x: b[0] / (1 + jnp.exp(b[1] - b[2] * x)) ** (1 / b[3]),
+    "Roszman1": lambda b, x: b[0] - b[1] * x - jnp.arctan(b[2] / (x - b[3])) / jnp.pi,
 }
+MODELS |= {"Lanczos3": MODELS["Lanczos1"], "Misra1a": MODELS["BoxBOD"], "Thurber": MODELS["Hahn1"]}
 
 
 @dataclasses.dataclass

@@ -234,13 +234,13 @@ def test_panels_of_a_narrow_figure_stand_below_each_other(recording, driver):
     import matplotlib.pyplot as plt
 
     fit = pictures.fit()
-    for call, size, rows in (
-        (lambda size: etid.plot(recording, size=size), (3.3, 3.6), 2),
-        (lambda size: etid.plot(recording, size=size), (6.6, 3.6), 1),
-        (lambda size: etid.plot(fit, recording, driver, show="impedance", size=size), (3.3, 6.0), 3),
-        (lambda size: etid.plot(fit, recording, driver, show="residual", size=size), (12.0, 4.0), 1),
+    for of, show, size, rows in (
+        ([recording], "pulse", (3.3, 3.6), 2),
+        ([recording], "pulse", (6.6, 3.6), 1),
+        ([fit, recording, driver], "impedance", (3.3, 6.0), 3),
+        ([fit, recording, driver], "residual", (12.0, 4.0), 1),
     ):
-        axes = call(size)
+        axes = etid.plot(*of, show=show, size=size, title=None)
         figure = axes[0].figure
         figure.canvas.draw()
         assert len({round(axis.get_position().y0, 2) for axis in axes}) == rows

@@ -50,11 +50,11 @@ def test_at_60_db_the_draws_have_the_errors_of_the_fit(clear, posterior):
     assert np.abs(cov / np.outer(errors, errors) - fit.correlation).max() < 0.15
 
 
-def test_what_bounds_tell_of_the_elements_moves_the_others_as_their_covariance_says():
+def test_what_bounds_tell_of_the_elements_moves_the_others_as_their_covariance_says(clear):
     """E and var of the rest, given a normal distribution of the elements: the law of total ones."""
     root = np.random.default_rng(0).normal(size=(5, 5))
     cov, mean = root @ root.T, np.arange(5.0)
-    fit, *_ = identified(60.0, 0)
+    fit, *_ = clear
     logs, told = np.asarray(fit.circuit.log_values()), 0.3 * cov[:3, :3]
     values = np.asarray(fit.circuit.values())
     fit = dataclasses.replace(fit, cov=told * np.outer(values, values))

@@ -99,13 +99,10 @@ def test_static_mistakes_are_named(fields, message):
         made()
 
 
-COPIES = pytest.mark.parametrize(
+@pytest.mark.parametrize(
     "copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))], ids=["copy", "pickle"]
 )
-
-
-@COPIES
-def test_a_copy_of_a_recording_holds_the_same_and_cannot_be_changed(copied):
+def test_a_copy_holds_the_same_cannot_be_changed_and_opens_its_file(copied, tmp_path, monkeypatch):
     codes = Samples(np.array([1, -2, 3], "i2"), 0.5, 1.0)
     one = recording(3, v_th=codes, path="s01", subject="s01", adc_range=(-1.0, 2.0))
     again = copied(one)
@@ -115,10 +112,6 @@ def test_a_copy_of_a_recording_holds_the_same_and_cannot_be_changed(copied):
     np.testing.assert_array_equal(again.v_out, one.v_out)
     with pytest.raises(ValueError, match="read-only"):
         again.samples["v_th"].stored[0] = 1
-
-
-@COPIES
-def test_a_copy_of_a_part_of_a_file_opens_the_file_again(copied, tmp_path, monkeypatch):
     study().write(tmp_path / "study.h5")
     monkeypatch.chdir(tmp_path)
     with hdf5.read("study.h5") as whole, copied(whole.where(subject="s01")) as part:
@@ -133,16 +126,11 @@ def test_an_error_says_where_what_and_what_to_do_and_survives_pickling():
     )
     assert str(error) == "a.h5, 's01', sample_rate: is 0 Hz. Mend it."
     again = pickle.loads(pickle.dumps(error))
-    assert (str(again), again.file, again.path, again.field, again.remedy) == (
-        str(error),
-        "a.h5",
-        "s01",
-        "sample_rate",
-        "Mend it",
-    )
+    parts = again.file, again.path, again.field, again.remedy
+    assert (str(again), parts) == (str(error), ("a.h5", "s01", "sample_rate", "Mend it"))
 
 
-def test_a_study_is_an_ordered_mapping_of_paths():
+def test_a_study_is_an_ordered_mapping_of_paths_from_which_labels_select():
     paths = ["calibration/98k8", "s01/dry/0", "s01/dry/1", "s02/damp"]
     assert list(study()) == [one.path for one in study().recordings()] == paths
     assert len(study()) == 4
@@ -150,31 +138,23 @@ def test_a_study_is_an_ordered_mapping_of_paths():
     assert "s02" not in study()
     assert study()["/s02/damp"].electrode == "E17"
     assert repr(study()) == "<Study: 1 calibration, 3 loaded>"
+    for labels, expected in (
+        ({"subject": "s01"}, paths[1:3]),
+        ({"subject": "s01", "trial": 1}, paths[2:3]),
+        ({"condition": "damp", "electrode": "E17"}, paths[3:]),
+        ({"subject": "s03"}, []),
+        ({}, paths),
+    ):
+        assert list(study().where(**labels)) == expected
 
 
-def test_where_selects_by_labels_and_keeps_the_order():
-    assert list(study().where(subject="s01")) == ["s01/dry/0", "s01/dry/1"]
-    assert list(study().where(subject="s01", trial=1)) == ["s01/dry/1"]
-    assert list(study().where(condition="damp", electrode="E17")) == ["s02/damp"]
-    assert list(study().where(subject="s03")) == []
-    assert list(study().where()) == list(study())
-
-
-@pytest.mark.parametrize(
-    ("path", "message"),
-    [
+def test_wrong_paths_are_refused_and_answered_with_those_that_are_near():
+    for path, message in (
         ("s01/dry", r"group of 2 recordings: 's01/dry/0' … 's01/dry/1'"),
         ("s02/dump", r"no recording 's02/dump'.*'s02/damp'"),
-    ],
-)
-def test_a_path_of_no_recording_is_answered_with_those_that_are_near(path, message):
-    with pytest.raises(KeyError, match=message):
-        study()[path]
-
-
-@pytest.mark.parametrize(
-    ("paths", "message"), [(["a", "a"], "two recordings"), (["a", "a/b/c"], "inside another")]
-)
-def test_paths_that_cannot_share_a_file_are_refused(paths, message):
-    with pytest.raises(RecordingError, match=message):
-        Study.from_recordings([recording(path=path) for path in paths])
+    ):
+        with pytest.raises(KeyError, match=message):
+            study()[path]
+    for paths, message in ((["a", "a"], "two recordings"), (["a", "a/b/c"], "inside another")):
+        with pytest.raises(RecordingError, match=message):
+            Study.from_recordings([recording(path=path) for path in paths])

@@ -15,6 +15,7 @@ import pytest
 
 import etid
 from etid.circuits.impedance import realise
+from etid.identify.options import Options
 from etid.plotting import figure_of
 from etid.plotting.style import new_figure, save
 from etid.results.driver import ContinuousDriver
@@ -25,6 +26,7 @@ from etid.simulation.transformer import ResistorLoad, SkinLoad
 from tests import pictures
 
 RATE = 200e3
+GAIN = etid.Instrument(gain=1e-3)
 # `GUESS`: the type checker of the tests comes first, so that its error is any.
 REFUSED = r"""
 [ValueError]
@@ -63,6 +65,21 @@ skin(of, bounds={'r_x': (1.0, 1000.0)}, circuit='auto') -> 'r_x' is no element o
 skin(of, bounds={'r_s': (1.0, 1000.0)}, fixed={'r_s': 5.0}) -> r_s is fixed and has bounds
 skin(of, bounds={'r_s': (1.0, 1000.0)}, method='non_parametric')
     -> 'non_parametric' takes no known elements and no bounds
+of.impedance.posterior() -> a measured impedance has no draws and no profiles
+of.impedance.plot(show='residual') -> no residual in time
+etid.Instrument(gain=-1e-3) -> gain
+etid.Instrument(capacitance=5.0) -> \[F\]
+etid.Instrument(r_load=5.0) -> relative
+etid.identify_driver(of.calibration, instrument=GAIN, method='output_error') -> output_error
+etid.identify_skin(of.skin, of.tolerant, method='output_error') -> output_error
+etid.identify_driver(of.calibration, method='steiglitz_mcbride(steps=3)') -> has no such options
+etid.identify_driver(of.calibration, method='steiglitz_mcbride(iterations=0)')
+    -> has no such options
+etid.identify_driver(of.calibration, method='steiglitz_mcbride(iterations=')
+    -> has no such options
+Options.of(method='proportion') -> not known; use one of maximum_likelihood
+etid.register(etid.SteiglitzMcBride(iterations=3)) -> is the name of SteiglitzMcBride
+etid.identify_amplitudes([of.alone], circuit=Twice()) -> 2 resistors that depend on their current
 etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 2.0]) -> shape
 etid.identify_impedance([0.0, 2.0, 3.0], [1.0, 2.0, 3.0]) -> frequency must be
 etid.identify_impedance([1.0, 2.0, 3.0], [1.0, np.nan, 3.0]) -> 1 impedances are not finite
@@ -147,7 +164,11 @@ etid.Tracker.of(of.driver, cut(of.calibration, 1500), electrodes=1) -> not_perio
 etid.identify_driver(of.calibration, method=GUESS) -> guess
 etid.identify_skin(of.skin, of.driver, method=GUESS) -> guess
 etid.identify_study(of.study, method=GUESS) -> guess
+etid.identify_driver(of.calibration, instrument=1e-3) -> instrument
 [RecordingError]
+etid.identify_skin(of.alone, circuit=etid.SkinCurrent()) -> identify_amplitudes
+etid.identify_amplitudes([]) -> is empty
+etid.identify_amplitudes([of.alone, of.short]) -> recordings\[1\].*9000 samples
 etid.identify_skin(of.skin) -> current: was not recorded
 of.alone.v_th -> v_th: was not recorded
 of.alone.replace(current=None) -> v_th: is not given.*or current
@@ -175,13 +196,18 @@ def of():
     driver = etid.identify_driver(calibration, order=5)
     tracker = etid.Tracker.of(driver, calibration, electrodes=2)
     made = jax.tree.map(np.asarray, pictures.fit())
+    alone, frequency = both.without_v_th(), np.geomspace(60.0, 1e5, 20)
+    z = np.asarray(pictures.SKIN.response(jnp.asarray(frequency)))
     return types.SimpleNamespace(
         study=study,
         calibration=calibration,
         both=both,  # V_th, V_out and the current
         skin=both.replace(current=None),
-        alone=both.without_v_th(),
+        alone=alone,
+        short=alone.replace(v_out=alone.v_out[:9_000], current=np.asarray(alone.current)[:9_000]),
+        impedance=etid.identify_impedance(frequency, z),
         driver=driver,
+        tolerant=etid.identify_driver(calibration, instrument=GAIN),
         discrete=etid.identify_driver(calibration, method="equation_error", throw=False),
         fit=etid.identify_skin(both.replace(current=None), driver),
         tracker=tracker,
@@ -198,6 +224,17 @@ def cut(recording, size):
 
 def faster(recording):
     return recording.replace(sample_rate=2 * RATE, pulse_rate=120.0)
+
+
+class Twice(etid.AbstractCircuit):
+    """Two resistors that depend on their current."""
+
+    r: float = etid.parameter("ohm", typical=1e5)
+    i_0: float = etid.parameter("ampere", typical=1e-3)
+
+    def impedance(self):
+        part = etid.current_dependent_resistor(self.r, self.i_0)
+        return etid.series(part, part)
 
 
 def skin(of, **options):
@@ -223,20 +260,9 @@ def limited(of, **limits):
     return etid.Controller.of(of.tracker, **limits)
 
 
-USED = (
-    cut,
-    faster,
-    skin,
-    samples,
-    tracker,
-    of_others,
-    limited,
-    realise,
-    figure_of,
-    new_figure,
-    save,
-)
-NAMES = {one.__name__: one for one in (*USED, ContinuousDriver, verdict, Rational)} | {
+USED = cut, faster, skin, samples, tracker, of_others, limited, Twice
+TAKEN = realise, figure_of, new_figure, save, ContinuousDriver, verdict, Rational, Options
+NAMES = {one.__name__: one for one in (*USED, *TAKEN)} | {
     "etid": etid,
     "np": np,
     "jnp": jnp,
@@ -244,6 +270,7 @@ NAMES = {one.__name__: one for one in (*USED, ContinuousDriver, verdict, Rationa
     "pictures": pictures,
     "RATE": RATE,
     "GUESS": "guess",
+    "GAIN": GAIN,
     "WITH_CURRENT": "maximum_likelihood(with_current=True)",
 }
 ERRORS = {
@@ -271,12 +298,3 @@ def test_a_call_that_cannot_be_right_is_refused(of, call, error, words, tmp_path
     with pytest.raises(error, match=words):
         eval(call, NAMES | {"of": of})
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_impedance_has_no_draws_and_no_residual_in_time():
-    frequency = jnp.geomspace(60.0, 1e5, 20)
-    fit = etid.identify_impedance(frequency, np.asarray(pictures.SKIN.response(frequency)))
-    with pytest.raises(ValueError, match="a measured impedance has no draws and no profiles"):
-        fit.posterior()
-    with pytest.raises(ValueError, match="no residual in time"):
-        fit.plot(show="residual")

@@ -52,17 +52,9 @@ def state_equations(d, load):
         d.turns * v_m - d.r_secondary * i_2 - s,
         i_c,
     ]
-    storage = np.diag(
-        [
-            d.c_primary + d.c_winding,
-            d.c_secondary + d.c_winding,
-            d.c_cable + d.c_divider,
-            d.l_primary,
-            d.l_magnetising,
-            d.l_secondary,
-            load.c_p if isinstance(load, SkinLoad) else 1.0,
-        ]
-    )
+    c_p = load.c_p if isinstance(load, SkinLoad) else 1.0
+    windings = d.c_primary + d.c_winding, d.c_secondary + d.c_winding, d.c_cable + d.c_divider
+    storage = np.diag([*windings, d.l_primary, d.l_magnetising, d.l_secondary, c_p])
     storage[0, 1] = storage[1, 0] = -d.c_winding
     drive = np.zeros(7)
     drive[0] = 1 / d.r_source
@@ -130,31 +122,23 @@ def test_source_impedance_is_passive_for_any_elements(factors):
     default = TransformerDriver()
     names = [field.name for field in dataclasses.fields(default)]
     passive = [name for name in names if name[:2] in ("r_", "l_", "c_")]
-    changes = {
-        name: getattr(default, name) * factor
-        for name, factor in zip(passive, factors, strict=False)
-    }
+    each = zip(passive, factors, strict=False)
+    changes = {name: getattr(default, name) * factor for name, factor in each}
     f = np.concatenate([[0.0], np.geomspace(0.1, 1e7, 200)])
     z_th = dataclasses.replace(default, **changes).z_th(f)
     assert np.all(np.real(z_th) >= -1e-9 * np.abs(z_th))  # rounding where the phase is near 90°
 
 
-def test_direct_sum_equals_folded_transform(monkeypatch):
-    window = {"sample_rate": 100e3, "samples": 200, "start": 1e-4}
-    folded = one(DRY, **window, **CLEAN)
-    monkeypatch.setattr(transformer, "_MAX_BLOCK", 0)
-    summed = one(DRY, **window, **CLEAN)
-    # phases of up to 1e6 cycles keep 1e-10; times 50 V
-    np.testing.assert_allclose(summed.v_out, folded.v_out, rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("samples", [1, 600, 3333, 12_333, 30_000])
-def test_windows_of_any_length_and_start_cut_the_same_waveform(samples):
-    block = one(DRY, **CLEAN).v_out
-    first = 1234
-    window = one(DRY, samples=samples, start=first / 200e3, **CLEAN).v_out
-    expected = block[(first + np.arange(samples)) % 10_000]
-    np.testing.assert_allclose(window, expected, rtol=0, atol=1e-8)  # phase rounding, as above
+def test_windows_of_any_length_and_start_cut_the_same_waveform(monkeypatch):
+    block, first = one(DRY, **CLEAN).v_out, 1234
+    for samples in (1, 600, 3333, 12_333, 30_000):
+        window = one(DRY, samples=samples, start=first / 200e3, **CLEAN).v_out
+        expected = block[(first + np.arange(samples)) % 10_000]
+        # Phases of up to 1e6 cycles keep 1e-10; times 50 V.
+        np.testing.assert_allclose(window, expected, rtol=0, atol=1e-8)
+    monkeypatch.setattr(transformer, "_MAX_BLOCK", 0)  # a direct sum in the place of a transform
+    summed = one(DRY, samples=200, start=1e-4, **CLEAN).v_out
+    np.testing.assert_allclose(summed, block[20:220], rtol=0, atol=1e-8)
 
 
 def many(count, **settings):
@@ -258,43 +242,30 @@ def test_every_preset_simulates_and_tells_its_truth(name):
         assert path.startswith("calibration/") == recording.is_calibration
 
 
-def test_preset_elements_are_those_of_the_tables():
+def test_preset_elements_are_those_of_the_tables_and_in_the_published_ranges():
     truth = scenes.paper().truth()
     resistors = {path: e["r"] for path, e in truth.items() if path.startswith("resistors/")}
-    assert resistors == {
-        "resistors/21k62": 21.62e3,
-        "resistors/55k2": 55.20e3,
-        "resistors/216k6": 216.6e3,
-        "resistors/328k9": 328.9e3,
-        "resistors/555k": 555.0e3,
-    }
+    sizes = {"21k62": 21.62e3, "55k2": 55.2e3, "216k6": 216.6e3, "328k9": 328.9e3, "555k": 555e3}
+    assert resistors == {f"resistors/{name}": r for name, r in sizes.items()}
     built = [e for path, e in truth.items() if path.startswith("built/")]
     assert built == 23 * [{"r_s": 32.46e3, "r_p": 179.8e3, "c_p": 0.12e-9}]
     assert truth["typical/dry/01"] == {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
     assert truth["typical/damp/01"] == {"r_s": 6.1e3, "r_p": 17.4e3, "c_p": 0.66e-9}
     assert {"s01/dry/03", "s10/damp/05"} < truth.keys()
+    for condition, ranges in {
+        "dry": {"r_s": (19e3, 69.8e3), "r_p": (194e3, 616e3), "c_p": (45e-12, 165e-12)},
+        "damp": {"r_s": (3.9e3, 19.8e3), "r_p": (20.2e3, 165e3), "c_p": (160e-12, 845e-12)},
+    }.items():
+        trials = [t for t in scenes.paper_subjects().trials if t.condition == condition]
+        elements = {trial.subject: trial.load for trial in trials}
+        assert (len(trials), len(set(elements.values()))) == (50, 10)
+        assert all(trial.load == elements[trial.subject] for trial in trials)
+        for name, (low, high) in ranges.items():
+            assert all(low <= getattr(load, name) <= high for load in elements.values())
 
 
-@pytest.mark.parametrize(
-    ("condition", "ranges"),
-    [
-        ("dry", {"r_s": (19e3, 69.8e3), "r_p": (194e3, 616e3), "c_p": (45e-12, 165e-12)}),
-        ("damp", {"r_s": (3.9e3, 19.8e3), "r_p": (20.2e3, 165e3), "c_p": (160e-12, 845e-12)}),
-    ],
-)
-def test_subjects_lie_in_the_published_ranges_and_differ(condition, ranges):
-    trials = [t for t in scenes.paper_subjects().trials if t.condition == condition]
-    elements = {trial.subject: trial.load for trial in trials}
-    assert len(trials) == 50
-    assert len(set(elements.values())) == 10
-    assert all(trial.load == elements[trial.subject] for trial in trials)
-    for name, (low, high) in ranges.items():
-        assert all(low <= getattr(load, name) <= high for load in elements.values())
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_what_cannot_be_simulated_is_refused():
+    for make, message in (
         (lambda: Scene(2 * (Trial("a", DRY),)), "occur more than once"),
         (lambda: Scene((), (Trial("c", DRY),)), "needs a ResistorLoad"),
         (lambda: Scene(sample_rate=0.0), "sample_rate is 0"),
@@ -310,8 +281,6 @@ def test_subjects_lie_in_the_published_ranges_and_differ(condition, ranges):
         (lambda: Trial("a/", DRY), "cannot name a trial"),
         (lambda: one(lambda f: f[:1] + 0j), "load of 'x'"),
         (lambda: one(lambda f: np.nan * f), "load of 'x'"),
-    ],
-)
-def test_what_cannot_be_simulated_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()

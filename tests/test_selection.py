@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -64,46 +63,27 @@ def made(circuit, deviance, name="successful", z=(0.0,) * CHANGES, error=0.01, s
     )
 
 
-def test_a_richer_circuit_must_pay_for_its_elements():
-    skin, richer = made(etid.SkinRC(), 990.0), etid.SkinCole()
-    penalty = np.log(TERMS)
-    for gain, chosen in {
-        penalty - 1.0: 0,
-        penalty + 1.9: 0,  # not worth more than a bare mention
-        penalty + 2.1: 1,
-    }.items():
-        assert best({0: skin, 1: made(richer, 990.0 - gain)}) == chosen
-
-
-def test_noise_above_its_estimate_divides_the_evidence():
-    fits = {0: made(etid.SkinRC(), 4060.0), 1: made(etid.SkinCole(), 4000.0)}
-    found = bic(fits)
-    # 60 at four times the noise is 15.
-    assert found[0] - found[1] == pytest.approx(15.0 - np.log(TERMS))
-
-
-def test_adequate_comes_before_better():
-    fits = {
-        0: made(etid.SkinRC(), 900.0, "insensitive"),
-        1: made(etid.ParallelRC(), 990.0),
-        2: made(etid.Resistor(), 2000.0, "misfit"),
-    }
-    assert best(fits) == 1
-    del fits[1]
-    assert best(fits) == 0
-
-
-@pytest.mark.parametrize("name", ["insensitive", "driver_unclear", "misfit"])
-def test_a_richer_circuit_with_less_evidence_is_no_remedy(name):
-    simple = made(etid.SkinCole(), 900.0, name)
-    assert best({0: simple, 1: made(etid.SkinLayers(), 896.0)}) == 0
-    assert best({0: simple, 1: made(etid.SkinLayers(), 880.0)}) == 1
-
-
-def test_a_phase_of_a_capacitor_is_no_reason_for_a_constant_phase():
-    cole = etid.SkinCole(20e3, 100e3, 30e-6, 0.995)
-    assert rank(made(cole, 900.0)) == 1
-    assert rank(made(dataclasses.replace(cole, alpha=jnp.asarray(0.95)), 900.0)) == 0
+def test_the_best_circuit_is_adequate_and_a_richer_one_pays_for_its_elements():
+    skin, cole, penalty = etid.SkinRC(), etid.SkinCole(), np.log(TERMS)
+    for gain, chosen in (
+        (penalty - 1.0, 0),
+        (penalty + 1.9, 0),  # not worth more than a bare mention
+        (penalty + 2.1, 1),
+    ):
+        assert best({0: made(skin, 990.0), 1: made(cole, 990.0 - gain)}) == chosen
+    # Of two with equal evidence it is the simpler one.
+    assert best({0: made(skin, 990.0), 1: made(etid.ParallelRC(), 990.0 + penalty)}) == 1
+    found = bic({0: made(skin, 4060.0), 1: made(cole, 4000.0)})
+    assert found[0] - found[1] == pytest.approx(15.0 - penalty)  # 60 at four times the noise is 15
+    unclear, misfit = made(skin, 900.0, "insensitive"), made(etid.Resistor(), 2000.0, "misfit")
+    assert best({0: unclear, 1: made(etid.ParallelRC(), 990.0), 2: misfit}) == 1
+    assert best({0: unclear, 2: misfit}) == 0
+    for name in ("insensitive", "driver_unclear", "misfit"):  # of which less evidence is no remedy
+        for deviance, chosen in ((896.0, 0), (880.0, 1)):
+            fits = {0: made(cole, 900.0, name), 1: made(etid.SkinLayers(), deviance)}
+            assert best(fits) == chosen
+    for alpha, expected in ((0.995, 1), (0.95, 0)):  # the phase of a capacitor is no reason
+        assert rank(made(etid.SkinCole(20e3, 100e3, 30e-6, alpha), 900.0)) == expected
 
 
 def test_the_error_contains_the_difference_to_a_likely_circuit():
@@ -348,43 +328,34 @@ def test_a_joint_fit_takes_the_common_circuit(study):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cole", "layers"])
-def test_skin_that_is_not_one_rc_does_not_ask_for_a_calibration_first(name):
-    """At 40 dB, behind drivers drawn anew: all 10 of Cole and of two layers were `inconsistent`."""
-    dry = LOADS["dry"]
-    load = {
-        "cole": etid.SkinCole(dry.r_s, dry.r_p, dry.r_p * dry.c_p, 0.9),
-        "layers": etid.SkinLayers(33.4e3, 130e3, 0.17e-9, 56e3, 4e-9),
-    }[name]
+@pytest.mark.parametrize(
+    ("load", "snr_db"),
+    [
+        (etid.SkinCole(33.4e3, 186e3, 186e3 * 0.12e-9, 0.9), 40.0),
+        (etid.SkinLayers(33.4e3, 130e3, 0.17e-9, 56e3, 4e-9), 40.0),
+        (etid.SkinWarburg(31e3, 180e3, 90e-6), 50.0),
+    ],
+    ids=["cole", "layers", "warburg"],
+)
+def test_skin_that_is_not_one_rc_does_not_ask_for_a_calibration_first(load, snr_db):
+    """Behind drivers drawn anew: all 10 of Cole and of two layers were `inconsistent`.
+
+    Where charge diffuses SkinLayers was successful, with R_s 4 to 40 standard errors wrong, in 15
+    of 18.
+    """
     for number in range(3):
         made_with = drawn_driver(7000 + number, PARTS, TransformerDriver())
         scene = dataclasses.replace(
-            SCENE, trials=(Trial("a", load),), driver=made_with, snr_db=40.0
+            SCENE, trials=(Trial("a", load),), driver=made_with, snr_db=snr_db
         )
         study = scene.simulate(number)
         driver = etid.identify_driver(study["calibration"])
         plain = etid.identify_skin(study["a"], driver, throw=False)
         assert plain.verdict == "misfit" or plain.other_circuit
-        chosen = etid.identify_skin(study["a"], driver, circuit="auto")
-        # A normal error exceeds 3.5 standard errors once in 2 000.
-        error = float(chosen.circuit.values()[0]) - 33.4e3
-        assert abs(error) < 3.5 * float(np.sqrt(chosen.cov[0, 0]))
-
-
-@pytest.mark.slow
-def test_skin_through_which_charge_diffuses_is_found():
-    """SkinLayers was successful, with R_s 4 to 40 standard errors wrong, in 15 of 18."""
-    load = etid.SkinWarburg(31e3, 180e3, 90e-6)
-    for number in range(3):
-        scene = dataclasses.replace(
-            SCENE,
-            trials=(Trial("a", load),),
-            driver=drawn_driver(7000 + number, PARTS, TransformerDriver()),
-        )
-        study = scene.simulate(number)
-        driver = etid.identify_driver(study["calibration"])
         found = etid.select_circuit(study["a"], driver)
-        assert type(found.fit.circuit) is etid.SkinWarburg
-        assert found.weighed
-        error = float(found.fit.circuit.values()[0]) - 31e3
+        if isinstance(load, etid.SkinWarburg):
+            assert type(found.fit.circuit) is etid.SkinWarburg
+            assert found.weighed
+        # A normal error exceeds 3.5 standard errors once in 2 000.
+        error = float(found.fit.circuit.values()[0] - load.values()[0])
         assert abs(error) < 3.5 * float(np.sqrt(found.fit.cov[0, 0]))

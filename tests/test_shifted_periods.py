@@ -8,8 +8,8 @@ from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.recordings.causes import how_shifted
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
+from tests.skins import off
 from tests.test_changes import falling, recorded
-from tests.test_disturbances import off
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
@@ -115,7 +115,7 @@ def test_elements_behind_a_lost_sample_are_right(records, load):
         [faulty(records[load], fault, place, which) for fault, which, place in all_faults], driver
     )
     assert set(fits.verdicts) == {"successful"}
-    assert np.abs(off(fits, load)).max() < 4.0  # one noise for all: three normal numbers
+    assert np.abs(off(fits, LOADS[load])).max() < 4.0  # one noise for all: three normal numbers
     # A doubled sample in v_th makes its pulses seem rarer: of the record, five periods remain.
     told = (np.asarray(fits.fit.remarks) & int(Remark.periods_shifted)) > 0
     fifth = [fault == ("doubled", "v_th", 15_000) for fault in all_faults]

@@ -34,11 +34,6 @@ def tustin(circuit):
     return Rational(jnp.asarray(b), jnp.asarray(a))
 
 
-@pytest.fixture(scope="module")
-def published(reference_data):
-    return json.loads(reference_data("peer_cases.json").read_text())["steiglitz_mcbride"]["cases"]
-
-
 def impulse_fit(h, orders, iterations):
     """Model an impulse response, as `stmcb` does; the error of the simulated response decides."""
     impulse = jnp.zeros(h.size).at[0].set(1.0)
@@ -56,24 +51,21 @@ def impulse_fit(h, orders, iterations):
     return run(impulse[None], jnp.asarray(h)[None])
 
 
-def test_exact_data_give_back_the_filter(published):
-    case = published[0]
-    h = np.asarray(scipy.signal.lfilter(case["b"], case["a"], np.eye(case["n"])[0]))
-    best = impulse_fit(h, case["orders"], 8)
-    np.testing.assert_allclose(best.filter.num, case["b"], atol=case["tol"])
-    np.testing.assert_allclose(best.filter.den, case["a"], atol=case["tol"])
+def test_models_of_impulse_responses_are_those_published(reference_data):
+    cases = json.loads(reference_data("peer_cases.json").read_text())["steiglitz_mcbride"]["cases"]
+    exact, reduced = cases[0], cases[2]
+    h = np.asarray(scipy.signal.lfilter(exact["b"], exact["a"], np.eye(exact["n"])[0]))
+    best = impulse_fit(h, exact["orders"], 8)
+    np.testing.assert_allclose(best.filter.num, exact["b"], atol=exact["tol"])
+    np.testing.assert_allclose(best.filter.den, exact["a"], atol=exact["tol"])
     assert bool(best.stable)
-
-
-def test_reduction_of_a_butterworth_filter(published):
-    case = published[2]
-    b, a = np.asarray(scipy.signal.butter(6, 0.2))
-    h = np.asarray(scipy.signal.lfilter(b, a, np.eye(case["n"])[0]))
-    best = impulse_fit(h, case["orders"], 10)
+    b, a = np.asarray(scipy.signal.butter(6, 0.2))  # a filter of higher order
+    h = np.asarray(scipy.signal.lfilter(b, a, np.eye(reduced["n"])[0]))
+    best = impulse_fit(h, reduced["orders"], 10)
     # The reference is printed to 6 digits; the best iterate may be better than its fixed point.
-    assert float(best.rrse) <= case["sm_rel_err"] * (1 + 1e-6)
-    assert float(best.rrse) >= case["lm_output_error_optimum_rel_err"] * (1 - 1e-6)
-    np.testing.assert_allclose(best.filter.den, case["sm_fixed_point_a"], atol=2e-2)
+    assert float(best.rrse) <= reduced["sm_rel_err"] * (1 + 1e-6)
+    assert float(best.rrse) >= reduced["lm_output_error_optimum_rel_err"] * (1 - 1e-6)
+    np.testing.assert_allclose(best.filter.den, reduced["sm_fixed_point_a"], atol=2e-2)
 
 
 @pytest.fixture(scope="module")
@@ -110,11 +102,8 @@ def test_driver_and_skin_are_exact_on_discrete_data(exact):
     np.testing.assert_allclose(elements.values(), DAMP.values(), rtol=1e-7)
     assert bool(skin.converged)
     assert bool(skin.closed_loop_stable)
-
-
-def test_the_driver_is_exact_on_harmonics_of_discrete_data(exact):
-    """The same in the periodic steady state, with two resistors and harmonics that are left out."""
-    z_th, r = exact[3], jnp.array([98.8e3, 21.62e3])
+    # The same in the periodic steady state, with two resistors and harmonics that are left out.
+    r = jnp.array([98.8e3, 21.62e3])
     frequency = jnp.broadcast_to(60.0 * jnp.arange(1.0, 1601), (2, 1600))
     turn = 100 * (frequency / FS) ** 2
     x = jax.lax.complex(jnp.cos(turn), jnp.sin(turn)) / frequency.astype(complex)
@@ -125,7 +114,6 @@ def test_the_driver_is_exact_on_harmonics_of_discrete_data(exact):
     fit = jax.jit(functools.partial(periodic_driver_filter, order=3))
     best = fit(Spectrum(frequency, x, y, noise, noise, used), r, jnp.asarray(FS))
     z = delay_variable(jnp.linspace(0.0, 0.35, 30), 1.0)
-    # The regression squares nothing (QR), so errors are rounding times a condition near 1e6.
     np.testing.assert_allclose(best.filter(z), z_th(z), rtol=1e-7)
     assert float(best.rrse) < 1e-10
 
@@ -162,5 +150,5 @@ def test_the_magnitude_as_printed_costs_what_it_costs():
 def test_an_unstable_loop_is_reported_not_simulated():
     v_th = jnp.ones(200)
     unstable = Rational(jnp.array([-1.5, 0.0]), jnp.array([1.0, 0.0]))
-    _, stable = terminal_voltage(unstable, Rational(jnp.array([1.0, -0.9]), jnp.ones(1)), v_th)
+    _, stable = predict(unstable, Rational(jnp.array([1.0, -0.9]), jnp.ones(1)), v_th)
     assert not bool(stable)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
 import h5py
 import numpy as np
@@ -20,8 +21,7 @@ from etid.results.study_fits import StudyFits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
-# The paper's method: what is tested is the parts, not the fits, and it compiles fastest.
-METHOD = "equation_error"
+METHOD = "equation_error"  # what is tested is the parts, not the fits, and it compiles fastest
 PART = 4
 COUNT = 14  # three whole parts and a half
 
@@ -65,21 +65,17 @@ def same(file: pathlib.Path, expected: StudyFits) -> None:
 
 
 def test_parts_are_the_whole(source, whole, tmp_path):
-    target = tmp_path / "fits.h5"
-    outcome = fit_file(source, target, method=METHOD)
-    same(target, whole)
-    assert len(outcome.fits) == COUNT
-    assert set(outcome.drivers) == {("calibration/0",)}
-    assert [p.name for p in tmp_path.iterdir() if "parts" in p.name] == []
-
-
-def test_every_part_has_its_drivers_though_its_process_knew_them_before(source, whole, tmp_path):
     """The processes of a cluster outlive a run, and with them what they have identified."""
-    for name in ("first.h5", "second.h5"):
+    for name, own in (("alone.h5", False), ("first.h5", True), ("second.h5", True)):
+        target = tmp_path / name
         with concurrent.futures.ThreadPoolExecutor(1) as executor:
-            fit_file(source, tmp_path / name, method=METHOD, executor=executor)
-        same(tmp_path / name, whole)
-        assert set(StudyFits.read(tmp_path / name).drivers) == {("calibration/0",)}
+            options: dict[str, Any] = {"executor": executor} if own else {}
+            outcome = fit_file(source, target, method=METHOD, **options)
+        same(target, whole)
+        assert len(outcome.fits) == COUNT
+        for drivers in (outcome.drivers, StudyFits.read(target).drivers):
+            assert set(drivers) == {("calibration/0",)}
+        assert [p.name for p in tmp_path.iterdir() if "parts" in p.name] == []
 
 
 def test_an_interrupted_run_goes_on_where_it_was(source, whole, tmp_path, monkeypatch):

@@ -1,0 +1,28 @@
+"""Skins of these tests, and how far from them a fit is."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+import etid
+
+DRY = etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+DAMP = etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+
+
+def relative(fit):
+    """Relative standard errors."""
+    return np.asarray(fit.stderr.values()) / np.asarray(fit.circuit.values())
+
+
+def off(fit, truth: Any = DRY):
+    """Errors of the elements of one fit or of several, in standard errors.
+
+    Args:
+        fit: One fit, or several along the first axis.
+        truth: A circuit or a load, or values [SI] for each fit or for all.
+    """
+    truth = dataclasses.astuple(truth) if hasattr(truth, "__dataclass_fields__") else truth
+    error = np.asarray(fit.circuit.values()) - np.asarray(truth)
+    return error / np.asarray(fit.stderr.values())
