@@ -1,15 +1,14 @@
 """Would the tests tell? Bugs are put in, one at a time, and the tests that execute them run.
 
 Mutants (`benchmarks.mutants`) are drawn by a seed from all modules of etid, in a copy of the
-working tree. First every file of the ordinary tests runs once, in a process of its own, and its
-executed lines are noted. A mutant is then judged by all files that execute its line; one outside of
-functions, by all files that execute any function of the module. Tests that killed a mutant of the
-module come first, then the fastest files. A mutant that all of them let pass has survived, and so
-has one that no test executes. Some are no bug at all; they are counted all the same.
+working tree. First every file of the ordinary tests runs once, and its executed lines are noted. A
+mutant is then judged by all files that execute its line; one outside of functions, by all files
+that execute any function of the module. What all of them let pass has survived, and so has what no
+test executes. Some mutants are no bug at all; they are counted all the same. They are done in the
+order in which they were drawn: what is done is a fair sample.
 
-Mutants are done in the order in which they were drawn: what is done is a fair sample. mutmut wraps
-every function, which compiled code and checks of types see, and cosmic-ray starts Python and JAX
-anew for each mutant and runs the same tests for all.
+mutmut wraps every function, which compiled code and checks of types see, and cosmic-ray starts
+Python and JAX anew for each mutant and runs the same tests for all.
 """
 
 import argparse
@@ -194,12 +193,6 @@ def show(rows: Sequence[Mapping[str, Any]]) -> Target:
     return Target(name, share, *limits, text, interval)
 
 
-def module_names(root: pathlib.Path) -> list[str]:
-    """All modules of etid, by their names below it."""
-    found = sorted((root / "etid").rglob("*.py"))
-    return [".".join(path.relative_to(root / "etid").with_suffix("").parts) for path in found]
-
-
 OPTIONS = (
     option("--mutants", default=40, help="how many to draw"),
     option("--modules", nargs="+", type=str, default=[], metavar="MODULE", help="of etid; all"),
@@ -210,8 +203,9 @@ OPTIONS = (
 
 
 def main(arguments: argparse.Namespace, root: pathlib.Path = ROOT) -> bool:
-    """Draw, judge, print and write; whether few enough mutants survive."""
-    names, every, calls = arguments.modules or module_names(root), list[Mutant](), {}
+    below = [path.relative_to(root / "etid") for path in sorted((root / "etid").rglob("*.py"))]
+    names = arguments.modules or [".".join(path.with_suffix("").parts) for path in below]
+    every, calls = list[Mutant](), {}
     for name in names:
         path = f"etid/{name.replace('.', '/')}.py"
         of = mutants(path, (root / path).read_text("utf-8"))

@@ -1,15 +1,11 @@
 """What causes the errors of the paper: its Tables I and IV from simulated measurements.
 
-Five laboratories make the same recordings. `good` has 60 dB and one clock. Each of the next three
-has one thing worse: white noise of 40 or of 30 dB, or trigger delays of 200 ns (rms) in every
-record, the calibration included. `both`, with 40 dB and 200 ns, is where the paper's method errs as
-much as the paper prints. The tables put the two causes apart: noise biases Steiglitz-McBride, the
-same in every trial; delays spread its trials. A study is made several times, each with a
-calibration of its own. `table_4.svg` shows error and scatter of the built circuit by cause.
-
-Rows are tidy: one per laboratory, method and element, beside what the paper prints. Errors, spreads
-and scatters are in per cent. A fit without a circuit (an estimate that is negative or complex)
-enters no statistics; `circuits` of `fits` do.
+Five laboratories make the same recordings: `good` with 60 dB and one clock, three with one thing
+worse (white noise of 40 or of 30 dB, or trigger delays of 200 ns rms in every record), and `both`,
+where the paper's method errs as much as the paper prints. Noise biases Steiglitz-McBride, the same
+in every trial; delays spread its trials. A study is made several times, each with a calibration of
+its own. Rows are one per laboratory, method and element, in per cent, beside what the paper prints.
+A fit without a circuit (an estimate that is negative or complex) enters no statistics.
 """
 
 import argparse
@@ -135,7 +131,7 @@ def targets(first: Sequence[Row], fourth: Sequence[Row]) -> Iterator[Target]:
     """Whether the default method is as right as it is to be."""
     resistors, mean = TARGETS
     good = [row for row in first if (row["laboratory"], row["method"]) == ("good", DEFAULT)]
-    yield Target(resistors, max(row["rms"] for row in good), *TARGETS[resistors])
+    yield Target.named(TARGETS, resistors, max(row["rms"] for row in good))
     for row in fourth:
         if (row["laboratory"], row["method"]) == (OWN_NOISE, DEFAULT):
             error = abs(row["error"]) / row["stderr"] * row["studies"] ** 0.5
@@ -194,7 +190,6 @@ def draw(rows: Sequence[Row], path: pathlib.Path) -> None:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Make, identify, print, write tables and figure; whether the targets are met."""
     folder, source, quick = arguments.folder, arguments.source, arguments.quick
     truth = etid.scenes.paper().truth()
     groups: dict[tuple[str, str], list[Outcome]] = {}

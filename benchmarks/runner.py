@@ -14,10 +14,11 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.machine import RESULTS, ROOT, provenance, write_csv
+from benchmarks.machine import RESULTS, ROOT, make_room, provenance, write_csv
 from benchmarks.rates import Rate
 from etid.identify import file as streaming
 from etid.recordings.replacing import replacing
@@ -50,11 +51,13 @@ def each(
     workers: int = 1,
     unit: str = "task",
     keep: str = "",
+    first: Callable[..., Any] | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Results of a call with the numbers of their tasks, as they are done.
 
     `keep` names a folder in which they are kept for other runs of this commit with these versions;
-    nothing is kept while the working tree is not that of a commit.
+    nothing is kept while the working tree is not that of a commit. Tasks with the smallest `first`
+    are begun first.
     """
     folder = _kept(keep) if keep else None
 
@@ -69,6 +72,8 @@ def each(
             yield number, pickle.loads(place(number).read_bytes())
             bar.update()
         left = [number for number in range(len(tasks)) if number not in done]
+        if first is not None:
+            left.sort(key=lambda number: first(*tasks[number]))
         for number, found in _called(call, {number: tasks[number] for number in left}, workers):
             if folder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
@@ -89,14 +94,22 @@ def _kept(name: str) -> pathlib.Path | None:
     return place
 
 
+def _done(call: Callable[..., Any], *task: Any) -> Any:
+    """A task in float64, in a worker process as well, and room for what the next one compiles."""
+    with jax.enable_x64(True):
+        found = call(*task)
+    make_room()
+    return found
+
+
 def _called(
     call: Callable[..., Any], tasks: Mapping[int, tuple], workers: int
 ) -> Iterator[tuple[int, Any]]:
     if workers == 1 or len(tasks) < 2:
-        yield from ((number, call(*task)) for number, task in tasks.items())
+        yield from ((number, _done(call, *task)) for number, task in tasks.items())
         return
     with streaming.processes(workers) as executor:
-        futures = {executor.submit(call, *task): number for number, task in tasks.items()}
+        futures = {executor.submit(_done, call, *task): number for number, task in tasks.items()}
         for future in concurrent.futures.as_completed(futures):
             yield futures[future], future.result()
 
@@ -153,6 +166,13 @@ class Target(NamedTuple):
     def of(cls, name: str, value: Rate, limits: Limits = (np.nan, np.nan)) -> "Target":
         """A rate, with its interval."""
         return cls(name, value.rate, *limits, str(value), (value.low, value.high))
+
+    @classmethod
+    def named(
+        cls, limits: Mapping[str, Limits], name: str, value: float, at: str = "", text: str = ""
+    ) -> "Target":
+        """A number with the limits that its name has, if any; `at` says which of several it is."""
+        return cls(f"{at}{name}", value, *limits.get(name, (np.nan, np.nan)), text)
 
     @property
     def met(self) -> bool:

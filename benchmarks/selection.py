@@ -26,6 +26,7 @@ from benchmarks.failure_draws import AUTO, Effort, answers
 from benchmarks.machine import median_time, timed, write_csv
 from benchmarks.perturbed_study import DELAY
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
+from benchmarks.rivals import RivalError
 from benchmarks.runner import Target, at_least, at_most, each, option, report, tabled
 from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
 from etid.selection.search import USUAL
@@ -196,7 +197,6 @@ def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Run the command."""
     quick, workers, folder = arguments.quick, arguments.workers, arguments.folder
     numbers = range(FIRST, FIRST + (FEW_DRIVERS if quick else arguments.drivers))
     tasks = [(float(snr), n) for snr in (FEW_SNR if quick else SNR_DB) for n in numbers]
@@ -209,12 +209,11 @@ def main(arguments: argparse.Namespace) -> bool:
     refused = len(tasks) - len(drawn) // len(TRUTHS)
     print(f"drivers that were not identified: {refused} of {len(tasks)}")
     targets = [*criteria(rows), *chosen(rows, drawn)]
-    missing = selection_rival.missing()
-    if missing:
-        print(f"impedance.py: {missing}")
-    else:
-        few = numbers[:RIVAL_DRIVERS]
+    few = numbers[:RIVAL_DRIVERS]
+    try:
         targets += rival(rows, [d for d in drawn if d.driver in few and d.snr_db in RIVAL_SNR])
+    except RivalError as error:
+        print(f"impedance.py: {error}")
     write_csv(folder / "selection.csv", rows)
     draw(rows, folder / "selection.svg")
     print(f"etid: {1e3 * select_time(FIRST):.0f} ms for a choice (median)")

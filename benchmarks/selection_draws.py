@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 import etid
 from benchmarks.ladder import LOADS, recorded
-from benchmarks.machine import make_room
 from benchmarks.perturbed_study import PARTS, drawn_driver
 from etid.circuits.circuit import AbstractCircuit, ParallelRC, Resistor, SkinCole, SkinRC
 from etid.identify.arguments import fed
@@ -101,23 +100,21 @@ def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Sele
 
 def draws(snr_db: float, number: int) -> list[Drawn]:
     """One recording of each truth behind a driver [dB]; none if the driver is not identified."""
-    with jax.enable_x64(True):  # of a worker process
-        study = scene(snr_db, number).simulate(number)
-        driver = etid.identify_driver(study["calibration"], throw=False)
-        if driver.verdict != "successful":
-            return []
-        records = [study[name] for name in TRUTHS]
-        chosen = choices(records, driver)
-        fits = [dict(one.fits) for one in chosen]
-        for candidate, circuit in enumerate(usual_circuits()):
-            rows = [row for row, of in enumerate(fits) if candidate not in of]
-            if rows:
-                more = etid.identify_skins([records[row] for row in rows], driver, circuit=circuit)
-                for place, row in enumerate(rows):
-                    fits[row][candidate] = more[place]
-        make_room()
-        of_all = zip(TRUTHS, chosen, fits, strict=True)
-        return [Drawn(name, snr_db, number, one, of) for name, one, of in of_all]
+    study = scene(snr_db, number).simulate(number)
+    driver = etid.identify_driver(study["calibration"], throw=False)
+    if driver.verdict != "successful":
+        return []
+    records = [study[name] for name in TRUTHS]
+    chosen = choices(records, driver)
+    fits = [dict(one.fits) for one in chosen]
+    for candidate, circuit in enumerate(usual_circuits()):
+        rows = [row for row, of in enumerate(fits) if candidate not in of]
+        if rows:
+            more = etid.identify_skins([records[row] for row in rows], driver, circuit=circuit)
+            for place, row in enumerate(rows):
+                fits[row][candidate] = more[place]
+    of_all = zip(TRUTHS, chosen, fits, strict=True)
+    return [Drawn(name, snr_db, number, one, of) for name, one, of in of_all]
 
 
 class Quantity(NamedTuple):

@@ -135,7 +135,6 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Fit the scenes, print the table, write it as CSV."""
     folder = arguments.data / FOLDER
     if not folder.exists():
         raise SystemExit(f"no SPICE recordings at {folder}; pass their parent folder with --data")
