@@ -231,4 +231,4 @@ def main(_: argparse.Namespace) -> bool:
             print(f"  {solver:<38}{error:<14.1e}{times}", flush=True)
     print(missing)
     [name] = TARGETS
-    return report([Target.named(TARGETS, name, worst)]) and not missing
+    return report([Target.of(TARGETS, name, worst)]) and not missing

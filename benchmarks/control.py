@@ -69,7 +69,7 @@ OPTIONS = (
     option("--snr", default=(60.0, 40.0), help="dB"),
     option("--hazard-electrodes", default=96),
     option("--hazard-pulses", default=5210),
-    option("-o", "--output", type=pathlib.Path, default=RESULTS / "control.svg"),
+    option("-o", "--output", default=RESULTS / "control.svg"),
 )
 
 
@@ -106,7 +106,7 @@ def hazards(arguments: argparse.Namespace) -> Iterator[Target]:
     write_csv(arguments.output.with_suffix(".csv"), rows)
     names = list(TARGETS)[2:]
     for name, column in zip(names, ("above_otherwise", "above_stated_worst"), strict=True):
-        yield Target.named(TARGETS, name, sum(row[column] for row in rows))
+        yield Target.of(TARGETS, name, sum(row[column] for row in rows))
 
 
 class Run(NamedTuple):
@@ -142,8 +142,8 @@ class Run(NamedTuple):
         near, largest = list(TARGETS)[:2]
         missed = int(np.sum(self.errors(counts) > NEAR))
         text = f"{missed} of {counts.sum()} ({self.allowed[counts].sum():.1f} by noise alone)"
-        yield Target.named(TARGETS, near, missed, at, text)
-        yield Target.named(TARGETS, largest, float(self.peak.max()), at)
+        yield Target.of(TARGETS, near, missed, at, text=text)
+        yield Target.of(TARGETS, largest, float(self.peak.max()), at)
 
 
 def identifying(scene: Scene, display: Display, load: np.ndarray) -> Run:

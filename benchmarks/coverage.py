@@ -209,8 +209,8 @@ def targets(name: str, of: Draws) -> Iterator[Target]:
     silent = np.sum(np.abs(of.z).max(axis=1, initial=0.0) > SILENT)
     text = f"{silent} of {len(of.verdicts)} fits; {counted(of.verdicts)}"
     first, second = TARGETS
-    yield Target.of(f"{name}: {first}", inside, TARGETS[first])
-    yield Target.named(TARGETS, second, float(silent), f"{name}: ", text)
+    yield Target.of(TARGETS, first, inside, f"{name}: ")
+    yield Target.of(TARGETS, second, float(silent), f"{name}: ", text=text)
 
 
 def main(arguments: argparse.Namespace) -> bool:

@@ -23,7 +23,7 @@ from benchmarks.runner import QUICK, option, show
 from etid.estimators.maximum_likelihood.search import WELL
 
 PINNED = True
-OPTIONS = (QUICK, option("--folder", default=pathlib.Path(), type=pathlib.Path))
+OPTIONS = (QUICK, option("--folder", default=pathlib.Path()))
 SAMPLES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 LANES = (1, 4, 16, 64, 256, 1_024, 10_000, 100_000)
 LIMIT = 20.0  # [s] of one call; longer ones end their curve

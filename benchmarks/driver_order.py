@@ -120,4 +120,4 @@ def main(arguments: argparse.Namespace) -> bool:
         found |= {f"order, {name}": order for name, order in orders_of.items()}
     else:
         print(f"no SPICE recordings at {folder}; pass their parent folder with --data")
-    return report(Target.named(TARGETS, *of) for of in found.items())
+    return report(Target.of(TARGETS, *of) for of in found.items())

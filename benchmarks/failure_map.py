@@ -114,11 +114,11 @@ def targets(rows: Sequence[Mapping[str, Any]], every: Sequence[Answer]) -> Itera
     for row in rows:
         if row["method"] == DEFAULT and row["missed_low"] > TARGETS[single][1]:
             place = ", ".join(row[name] for name in ("map", "row", "column"))
-            yield Target(f"{single}: {place}", row["missed_low"], *TARGETS[single])
+            yield Target.of(TARGETS, single, row["missed_low"], after=f": {place}")
     asked = [a for a in every if a.method == DEFAULT and a.target]
     if asked:
         missed = rate([a.missed for a in asked], [a.seed for a in asked])
-        yield Target.of(overall, missed, TARGETS[overall])
+        yield Target.of(TARGETS, overall, missed)
 
 
 def ranking(every: Sequence[Answer]) -> Iterator[Target]:

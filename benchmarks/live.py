@@ -42,7 +42,7 @@ OPTIONS = (
     option("--electrodes", default=98),
     option("--minutes", default=10.0),
     option("--windows", default=2, help="readers of the page"),
-    option("-o", "--output", type=pathlib.Path, default=RESULTS / "live.csv"),
+    option("-o", "--output", default=RESULTS / "live.csv"),
 )
 
 
@@ -114,7 +114,7 @@ def main(arguments: argparse.Namespace) -> bool:
         "growth of the loop's memory [MB]": grown[0],
         "growth of the page's memory [MB]": grown[1],
     }
-    found = [Target.named(TARGETS, name, float(value)) for name, value in numbers.items()]
+    found = [Target.of(TARGETS, name, float(value)) for name, value in numbers.items()]
     return report(found, arguments.output)
 
 

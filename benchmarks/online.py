@@ -8,7 +8,6 @@ false alarms and the detection of wet skin (`benchmarks.online_alarms`).
 
 import argparse
 import gc
-import pathlib
 import time
 from collections.abc import Iterator
 
@@ -44,7 +43,7 @@ OPTIONS = (
     option("--electrodes", default=98),
     option("--ticks", default=2000),
     option("--hours", default=4.0, help="electrode hours of false alarms; 0 for none"),
-    option("-o", "--output", type=pathlib.Path, default=RESULTS / "online.csv"),
+    option("-o", "--output", default=RESULTS / "online.csv"),
 )
 
 
@@ -53,7 +52,7 @@ def main(arguments: argparse.Namespace) -> bool:
     found = list(ticks(electrodes, arguments.ticks))
     for snr_db in NOISES if hours > 0 else ():
         counts = alarms(electrodes, snr_db, hours).items()
-        found += [Target.named(TARGETS, *of, f"{snr_db:g} dB: ") for of in counts]
+        found += [Target.of(TARGETS, *of, f"{snr_db:g} dB: ") for of in counts]
     return report(found, arguments.output)
 
 
@@ -66,7 +65,7 @@ def ticks(electrodes: int, number: int) -> Iterator[Target]:
         # The processor's own time is less where other programs take turns on that core.
         for kind, of in (("wall: ", ratios), ("processor: ", busy)):
             value = float(np.percentile(of, percent))
-            yield Target.named(TARGETS, f"{name} of the tick / pulse period", value, kind)
+            yield Target.of(TARGETS, f"{name} of the tick / pulse period", value, kind)
     logs = np.asarray(state.electrodes.own)[:, :-1]
     some, theirs = pulses[np.arange(RIVAL_TICKS) % len(pulses)], np.nan
     try:
@@ -75,7 +74,7 @@ def ticks(electrodes: int, number: int) -> Iterator[Target]:
         print(f"filterpy: {error}")
     period = tracker.period / tracker.model.bands.sample_rate
     factor = theirs / (period * float(np.median(busy)))
-    yield Target.named(TARGETS, "filterpy's extended Kalman filter / tick", factor, "processor: ")
+    yield Target.of(TARGETS, "filterpy's extended Kalman filter / tick", factor, "processor: ")
 
 
 def timed(

@@ -149,12 +149,12 @@ def targets(answers: Sequence[Answer]) -> Iterator[Target]:
         name, place, count = row["perturbation"], (row["path"], row["snr_db"]), row[silent]
         known = INVISIBLE.get(name)
         if count and not (known and known.excuses(*place, count, row["answers"])):
-            where = f"{silent}: {name}, {place[0]} at {place[1]:g} dB"
-            yield Target(where, count, *TARGETS[silent], f"{count} of {row['answers']}")
+            where, text = f": {name}, {place[0]} at {place[1]:g} dB", f"{count} of {row['answers']}"
+            yield Target.of(TARGETS, silent, count, after=where, text=text)
     for row in table(answers, ("perturbation",)):
         if row["perturbation"] in UNDISTURBED:
             share = (row["refused"] + row["said"]) / row["answers"]
-            yield Target(f"{refused}: {row['perturbation']}", share, *TARGETS[refused])
+            yield Target.of(TARGETS, refused, share, after=f": {row['perturbation']}")
 
 
 def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:

@@ -41,12 +41,11 @@ def main(arguments: argparse.Namespace) -> bool:
             f"{nuts:>8.1f}"
         )
         farthest = np.take_along_axis(ratio, np.abs(ratio - 1).argmax(0)[None], 0)[0]
-        for (name, limits), of, worst in zip(
-            TARGETS.items(), (shift, ratio), (shift.max(0), farthest), strict=True
-        ):
+        for name, of, worst in zip(TARGETS, (shift, ratio), (shift.max(0), farthest), strict=True):
             for element, middle, far in zip(ELEMENTS, np.median(of, axis=0), worst, strict=True):
                 text = f"{middle:.3f} (worst {far:.2f})"
-                asked.append(Target(f"{snr_db:g} dB, {element}: {name}", middle, *limits, text))
+                place = f"{snr_db:g} dB, {element}: "
+                asked.append(Target.of(TARGETS, name, middle, place, text=text))
     return report(asked)
 
 

@@ -42,7 +42,7 @@ def option(*names: str, default: Any = None, **settings: Any) -> Option:
 
 QUICK = option("--quick", default=False, help="few cases and draws, in a minute or two")
 WORKERS = option("--workers", default=2, help="processes, each on a core of its own")
-FOLDER = option("--folder", default=RESULTS, type=pathlib.Path, help="of tables and pictures")
+FOLDER = option("--folder", default=RESULTS, help="of tables and pictures")
 
 
 def each(
@@ -163,16 +163,24 @@ class Target(NamedTuple):
     interval: tuple[float, float] | None = None  # its scatter, if known; it excuses nothing
 
     @classmethod
-    def of(cls, name: str, value: Rate, limits: Limits = (np.nan, np.nan)) -> "Target":
-        """A rate, with its interval."""
-        return cls(name, value.rate, *limits, str(value), (value.low, value.high))
-
-    @classmethod
-    def named(
-        cls, limits: Mapping[str, Limits], name: str, value: float, at: str = "", text: str = ""
+    def of(
+        cls,
+        limits: Mapping[str, Limits],
+        name: str,
+        value: float | Rate,
+        before: str = "",
+        after: str = "",
+        text: str = "",
+        interval: tuple[float, float] | None = None,
     ) -> "Target":
-        """A number with the limits that its name has, if any; `at` says which of several it is."""
-        return cls(f"{at}{name}", value, *limits.get(name, (np.nan, np.nan)), text)
+        """A number or a rate with the limits that its name has, if any.
+
+        What stands `before` or `after` the name says which of several numbers it is.
+        """
+        if isinstance(value, Rate):
+            text, interval, value = str(value), (value.low, value.high), value.rate
+        of = limits.get(name, (np.nan, np.nan))
+        return cls(f"{before}{name}{after}", value, *of, text, interval)
 
     @property
     def met(self) -> bool:

@@ -49,7 +49,7 @@ METHODS = (None, "equation_error")  # None is the default one
 OPTIONS = (
     QUICK,
     option("--recordings", default=100_000),
-    option("--folder", default=FILES, type=pathlib.Path, help="of the files it makes"),
+    option("--folder", default=FILES, help="of the files it makes"),
     option("-o", "--output", type=pathlib.Path, help="CSV to write"),
 )
 
@@ -264,7 +264,7 @@ def targets(table: Sequence[dict[str, Any]], resumed: bool) -> Iterator[Target]:
         max(row["memory_mb"] for row in fits),
         float(not resumed),
     )
-    yield from (Target.named(TARGETS, *of) for of in zip(TARGETS, values, strict=True))
+    yield from (Target.of(TARGETS, *of) for of in zip(TARGETS, values, strict=True))
 
 
 def main(arguments: argparse.Namespace) -> bool:

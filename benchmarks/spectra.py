@@ -227,7 +227,7 @@ def with_fault(seed: int, spectra: int) -> Iterator[Target]:
         wrong = [one for one, said in zip(seeds, answers, strict=True) if said.silent]
         counts = counted(np.array([one.verdict for one in answers]))
         text = f"{len(wrong)} silent {wrong or ''}; {counts}"
-        yield Target(f"{name}: silent", len(wrong), *TARGETS["silent"], text)
+        yield Target.of(TARGETS, "silent", len(wrong), f"{name}: ", text=text)
 
 
 def without_fault(seed: int, spectra: int) -> Iterator[Target]:
@@ -246,8 +246,9 @@ def without_fault(seed: int, spectra: int) -> Iterator[Target]:
             (refused / len(answers), f"{refused} of {len(answers)}; {counted(verdicts)}", None),
             (float(inside.mean()), f"{inside.mean():.4f}, {rms}", interval),
         )
-        for (name, limits), (value, text, scatter) in zip(TARGETS.items(), values, strict=True):
-            yield Target(f"good, {points} frequencies: {name}", value, *limits, text, scatter)
+        of = f"good, {points} frequencies: "
+        for name, (value, text, scatter) in zip(TARGETS, values, strict=True):
+            yield Target.of(TARGETS, name, value, of, text=text, interval=scatter)
 
 
 def main(arguments: argparse.Namespace) -> bool:

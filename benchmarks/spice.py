@@ -66,7 +66,6 @@ ESTIMATORS: tuple[str, ...] = (*names(), JOINT)
 DATA = option(
     "--data",
     default=pathlib.Path("../shared/data"),
-    type=pathlib.Path,
     help=f"folder that has {FOLDER}/, recordings with known truth",
 )
 OPTIONS = (
