@@ -2,8 +2,8 @@
 
 Annotations, docstrings, texts, `assert`s for the type checker and decorators are left alone: what
 they change no test should see. So is what changes nothing by construction: the order of arguments
-of a function that does not know it, `zip(..., strict=True)`, a tiny constant times three, which
-becomes 1. A mutant of `os.sched_setaffinity` could act on other processes of this machine.
+of a function that does not know it, and `zip(..., strict=True)`. Three times a tiny constant is as
+tiny, so it becomes 1. A mutant of `os.sched_setaffinity` could act on other processes.
 """
 
 import ast
@@ -96,7 +96,7 @@ def _parts(node: ast.AST, inside: bool = False) -> Iterator[tuple[ast.AST, bool]
 
 def _is_silent(node: ast.AST) -> bool:
     silent = ast.Assert | ast.Raise | ast.Import | ast.ImportFrom | ast.JoinedStr
-    affinity = isinstance(node, ast.Call) and ast.unparse(node.func) == "os.sched_setaffinity"
+    affinity = isinstance(node, ast.Call) and "sched_setaffinity" in ast.unparse(node.func)
     strict = isinstance(node, ast.keyword) and node.arg == "strict"
     return affinity or strict or isinstance(node, silent)
 

@@ -161,19 +161,18 @@ SKINS: Mapping[str, Change] = {
     "leak_100Rp": lab.skin_is(lambda skin: leaky(skin, 100 * skin.r_p)),
 }
 
-_parts = functools.partial(lab.parts, "th", "out")
 _ALL_PARTS = ("r_protection", "r_secondary", "l_secondary", "l_magnetising", "r_source")
 DRIVERS: Mapping[str, Change] = {
-    "driver_Rprot_x1.05": trials(_parts(r_protection=1.05)),
-    "driver_Rprot_x1.2": trials(_parts(r_protection=1.2)),
-    "driver_Rsw_x1.2": trials(_parts(r_secondary=1.2)),
-    "driver_Lls_x1.05": trials(_parts(l_primary=1.05, l_secondary=1.05)),
-    "driver_Lls_x1.2": trials(_parts(l_primary=1.2, l_secondary=1.2)),
-    "driver_Lm_x1.2": trials(_parts(l_magnetising=1.2)),
-    "driver_Rsrc_x1.2": trials(_parts(r_source=1.2)),
-    "driver_Csec_x1.1": trials(_parts(c_secondary=1.1)),
-    "driver_Ccab_x1.1": trials(_parts(c_cable=1.1)),
-    "driver_all_5%": trials(_parts(**dict.fromkeys(_ALL_PARTS, 1.05))),
+    "driver_Rprot_x1.05": trials(lab.parts(r_protection=1.05)),
+    "driver_Rprot_x1.2": trials(lab.parts(r_protection=1.2)),
+    "driver_Rsw_x1.2": trials(lab.parts(r_secondary=1.2)),
+    "driver_Lls_x1.05": trials(lab.parts(l_primary=1.05, l_secondary=1.05)),
+    "driver_Lls_x1.2": trials(lab.parts(l_primary=1.2, l_secondary=1.2)),
+    "driver_Lm_x1.2": trials(lab.parts(l_magnetising=1.2)),
+    "driver_Rsrc_x1.2": trials(lab.parts(r_source=1.2)),
+    "driver_Csec_x1.1": trials(lab.parts(c_secondary=1.1)),
+    "driver_Ccab_x1.1": trials(lab.parts(c_cable=1.1)),
+    "driver_all_5%": trials(lab.parts(**dict.fromkeys(_ALL_PARTS, 1.05))),
     "driver_Vp_+2%_out_vs_th": trials(lab.parts("out", amplitude=1.02)),
     "driver_Vp_-2%_out_vs_th": trials(lab.parts("out", amplitude=0.98)),
 }

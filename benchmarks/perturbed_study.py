@@ -126,12 +126,12 @@ def late(samples: float) -> Callable[[Record], Record]:
 
 
 def parts(*voltages: str, **factors: float) -> Callable[[Record], Record]:
-    """Multiply parts of the driver behind some voltages."""
+    """Multiply parts of the driver behind some voltages, or behind both."""
 
     def change(of: Record) -> Record:
         driver = of.out.driver
         new = {name: getattr(driver, name) * factor for name, factor in factors.items()}
-        return _fields(*voltages)(driver=dataclasses.replace(driver, **new))(of)
+        return _fields(*(voltages or ("th", "out")))(driver=dataclasses.replace(driver, **new))(of)
 
     return change
 
