@@ -66,7 +66,7 @@ class Case(NamedTuple):
 
 
 # A solver, its error relative to the peak, and times [s]: alone, with derivatives, compilation.
-Line = tuple[str, *tuple[float, ...]]
+Line = tuple[str, float, *tuple[float, ...]]
 
 
 def cases() -> tuple[Case, Case]:

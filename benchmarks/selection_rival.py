@@ -110,8 +110,8 @@ def by_etid(every: Sequence[Spectra]) -> Chosen:
 def by_impedance_py(every: Sequence[Spectra]) -> Chosen:
     """What the rival chooses."""
     z, sigma, used = (np.concatenate([one[i] for one in every]) for i in (1, 2, 3))
-    problem = {"f": every[0].f, "z": z, "sigma": sigma, "used": used}
-    found = exchange("common", "circuits_by_impedance_py", **problem)
+    worker = "circuits_by_impedance_py"
+    found = exchange("common", worker, f=every[0].f, z=z, sigma=sigma, used=used)
     return by_truth(NAMES[np.argmin(found["bic"], axis=1)], found["seconds"])
 
 
