@@ -54,7 +54,7 @@ CASES = {
     ),
     "paper": (
         "--quick --folder {}", "table_1.csv table_4.csv table_4.svg",
-        "element r_s  paper_error 15.5  paper_scatter 43.2  error -28",
+        "element r_s  paper_error 15.5  paper_scatter 43.2  error -2",
     ),
     "perturbations": (
         "--quick --snr-db 60 --folder {}", "perturbations.csv perturbations.svg",
