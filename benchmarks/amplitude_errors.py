@@ -131,7 +131,6 @@ OPTIONS = (option("--draws", default=200, help="of each scene"),)
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print the table; whether the targets are met."""
     asked, names = list[Target](), etid.SkinCurrent.names()
     print(HEADS)
     for number, (heights, snr_db) in enumerate(SCENES):

@@ -1,20 +1,18 @@
 """Closed loop: the charge at 98 electrodes under a fingertip that changes, and the cap on it.
 
-`benchmarks.control_hazards` counts the pulses above the cap, with any load and with wrong records.
-The rest is the charge against ngspice (`benchmarks.control_plant`): some electrodes stay dry, some
-become wet within 100 ms, some sweat slowly, and one is lifted off and put back. The driver is
-identified from records of ngspice with the same noise and delays.
+`benchmarks.control_hazards` counts the pulses above the cap. The rest is the charge against ngspice
+(`benchmarks.control_plant`): some electrodes stay dry, some become wet within 100 ms, some sweat,
+and one is lifted off and put back.
 
-etid's rivals regulate the terminal voltage to that of a typical dry fingertip; keep an amplitude
-that is calibrated once, at the tenth pulse; integrate the error, A += k (Q* − Q) / q₀ with q₀ of
-typical dry skin (k = 0.25 is stable up to eight times this q₀); or adapt a feed-forward gain to a
-reference model by the normalised MIT rule (Åström and Wittenmark 1995, chapter 5). All of them get
-the true charge Q of the last pulse, as from a perfect sensor.
+etid's rivals get the true charge Q of the last pulse, as from a perfect sensor. They regulate the
+terminal voltage to that of a typical dry fingertip; keep an amplitude that is calibrated once, at
+the tenth pulse; integrate the error, A += k (Q* − Q) / q₀ with q₀ of typical dry skin (k = 0.25 is
+stable up to eight times this q₀); or adapt a feed-forward gain to a reference model by the
+normalised MIT rule (Åström and Wittenmark 1995, chapter 5).
 
-The targets count every pulse but those of a change and the two that follow it. Skin that sweats
-changes the charge by g after an amplitude is given; noise and calibration leave a standard error σ
-of the charge of the last pulse, by the information of the tracker. So many pulses as normal errors
-with mean g and this σ would miss the charge are printed beside those that did. They excuse none.
+The targets count every pulse but those of a change and the two that follow it. Beside what misses
+the charge stands how many normal errors would, by the sweating since the amplitude was given and
+the standard error of the charge of the last pulse. They excuse none.
 """
 
 import argparse
@@ -71,12 +69,11 @@ OPTIONS = (
     option("--snr", default=(60.0, 40.0), help="dB"),
     option("--hazard-electrodes", default=96),
     option("--hazard-pulses", default=5210),
-    option("-o", "--output", type=pathlib.Path, default=RESULTS / "control.svg"),
+    option("-o", "--output", default=RESULTS / "control.svg"),
 )
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print the errors of all controllers and draw them; whether etid meets the targets."""
     asked = list(hazards(arguments))
     fingertip = Fingertip(arguments.electrodes, arguments.pulses)
     runs: dict[str, Run] = {}
@@ -103,13 +100,13 @@ def hazards(arguments: argparse.Namespace) -> Iterator[Target]:
         found = control_hazards.Hazards(snr, seed)
         controller = found.controller(arguments.hazard_electrodes)
         given = found.given(controller, control_hazards.CELLS, arguments.hazard_pulses)
-        rows += [control_hazards.row(snr, cell, of) for cell, of in given.items()]
+        rows += [of.row(snr, cell) for cell, of in given.items()]
     for row in rows:
         show(row)
     write_csv(arguments.output.with_suffix(".csv"), rows)
     names = list(TARGETS)[2:]
     for name, column in zip(names, ("above_otherwise", "above_stated_worst"), strict=True):
-        yield Target(name, sum(row[column] for row in rows), *TARGETS[name])
+        yield Target.of(TARGETS, name, sum(row[column] for row in rows))
 
 
 class Run(NamedTuple):
@@ -122,7 +119,6 @@ class Run(NamedTuple):
 
     @classmethod
     def of(cls, rows: Sequence[tuple]) -> "Run":
-        """The same from one row a pulse."""
         return cls(*map(np.array, zip(*rows, strict=True)))
 
     def errors(self, counts: np.ndarray) -> np.ndarray:
@@ -146,8 +142,8 @@ class Run(NamedTuple):
         near, largest = list(TARGETS)[:2]
         missed = int(np.sum(self.errors(counts) > NEAR))
         text = f"{missed} of {counts.sum()} ({self.allowed[counts].sum():.1f} by noise alone)"
-        yield Target(f"{at}{near}", missed, *TARGETS[near], text)
-        yield Target(f"{at}{largest}", float(self.peak.max()), *TARGETS[largest])
+        yield Target.of(TARGETS, near, missed, at, text=text)
+        yield Target.of(TARGETS, largest, float(self.peak.max()), at)
 
 
 def identifying(scene: Scene, display: Display, load: np.ndarray) -> Run:

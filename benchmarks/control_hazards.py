@@ -129,14 +129,22 @@ class Given:
     worst: Float[np.ndarray, "pulse lane"]  # largest charge that the command stated [C]
     reason: np.ndarray  # what determined the amplitude
 
-    def above(self) -> Bool[np.ndarray, "pulse lane"]:
-        """Whether the charge exceeds the cap."""
-        return self.charge > CAP
-
-    def unseen(self, swapped: bool) -> Bool[np.ndarray, "pulse lane"]:
-        """Whether it does so because of a change that no record could show."""
-        seen = np.minimum(self.before, self.earlier) if swapped else self.before
-        return self.above() & (seen <= CAP)
+    def row(self, snr: float, cell: str) -> dict[str, Any]:
+        """What the cell shows, as a row of the table."""
+        above, reasons = self.charge > CAP, ("wanted", "charge", "confirmed", "fallback")
+        # No record could show the change.
+        seen = np.minimum(self.before, self.earlier) if cell == "swapped" else self.before
+        unseen = above & (seen <= CAP)
+        return {
+            "snr_db": snr,
+            "cell": cell,
+            "pulses": self.charge.size,
+            "above_after_unseen_change": int(unseen.sum()),
+            "largest_of_them_nC": round(1e9 * float(self.charge[unseen].max(initial=0.0)), 1),
+            "above_otherwise": int(np.sum(above & ~unseen)),
+            "above_stated_worst": int(np.sum(self.charge > self.worst)),
+            **{of: round(float(np.mean(self.reason == of)), 3) for of in reasons},
+        }
 
 
 class Hazards:
@@ -150,7 +158,6 @@ class Hazards:
         self.display = Display(scene, loads(self.rng), seed + 1)
 
     def controller(self, electrodes: int) -> etid.Controller:
-        """The controller of a display."""
         tracker = etid.Tracker.of(
             self.driver, self.records[0], electrodes=electrodes, change=CHANGE
         )
@@ -186,27 +193,3 @@ class Hazards:
             cell.name: Given(*(column[:, part] for column in whole))
             for cell, part in zip(of, parts, strict=True)
         }
-
-
-def row(snr: float, cell: str, given: Given) -> dict[str, Any]:
-    """What a cell shows, as a row of the table."""
-    above, unseen = given.above(), given.unseen(cell == "swapped")
-    reasons = {
-        name: round(float(np.mean(given.reason == name)), 3)
-        for name in ("wanted", "charge", "confirmed", "fallback")
-    }
-    return {
-        "snr_db": snr,
-        "cell": cell,
-        "pulses": given.charge.size,
-        "above_after_unseen_change": int(unseen.sum()),
-        "largest_of_them_nC": round(1e9 * float(given.charge[unseen].max(initial=0.0)), 1),
-        "above_otherwise": int(np.sum(above & ~unseen)),
-        "above_stated_worst": int(np.sum(given.charge > given.worst)),
-        **reasons,
-    }
-
-
-def good(row: dict[str, Any]) -> bool:
-    """Whether the cap holds but for unseen changes, and the stated worst case always."""
-    return row["above_otherwise"] == 0 and row["above_stated_worst"] == 0

@@ -8,7 +8,6 @@ grid of 0.4 µs. Where a load changes, the tails of the pulses before are those 
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ from etid.online.controller import Command
 from etid.online.state import TrackerState
 from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene
-from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver
+from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
 
 FINE = 12  # points per sample; a third of a sample must be whole points
 PERIODS = 6  # after which a pulse has decayed, even through a short circuit
@@ -43,18 +42,12 @@ def _points(scene: Scene, periods: int) -> int:
     return round(periods * scene.sample_rate / scene.pulse_rate) * FINE
 
 
-@functools.lru_cache(maxsize=1)
-def _thevenin(driver: TransformerDriver, points: int, rate: float) -> tuple[np.ndarray, ...]:
-    """Frequencies [Hz], V_th and Z_th [ohm]."""
-    f = np.fft.rfftfreq(points, 1 / rate)
-    return f, driver.v_th_spectrum(f) * rate, driver.z_th(f)
-
-
 def by_circuit(scene: Scene, load: Load) -> Waves:
     """The pulse over `PERIODS` by its spectrum."""
     points = _points(scene, PERIODS)
-    f, v, z_th = _thevenin(scene.driver, points, scene.sample_rate * FINE)
-    z = load(f)
+    rate = scene.sample_rate * FINE
+    f = np.fft.rfftfreq(points, 1 / rate)
+    v, z_th, z = scene.driver.v_th_spectrum(f) * rate, scene.driver.z_th(f), load(f)
     with np.errstate(invalid="ignore"):
         through = np.where(np.isinf(z), 0.0, v / (z + z_th))
         voltage = np.where(np.isinf(z), v, z * through)

@@ -1,14 +1,13 @@
 """Monte Carlo: do the intervals contain the truth as often as they say, and how far is the bound?
 
-Each repetition draws fresh noise, quantisation and trigger delays for the calibrations, a dry and a
-damp trial, and identifies a driver of its own: trials that share a driver share its error, and
-would not be independent draws. With `--current-snr-db` the loads are identified from the current
-alone, without calibrations; with `--resistors` too, from driver and current at once.
+Each repetition draws noise, quantisation and trigger delays of the calibrations, a dry and a damp
+trial, and identifies a driver of its own: trials that share a driver share its error. With
+`--current-snr-db` the loads are identified from the current alone; with `--resistors` too, from
+driver and current at once.
 
-Printed are, beside the bound, the part of the 95 % intervals that hold the truth and the root mean
-square of z = error / standard error, each with the range that 99 of 100 runs with right standard
-errors fall into: of a binomial count, and of chi-squared with a degree of freedom for each fit. The
-target is of all elements of a load: a single one scatters by 1.5 % with 200 draws.
+The part of the 95 % intervals that hold the truth, and the root mean square of z = error / standard
+error, stand beside the ranges into which 99 of 100 runs with right standard errors fall. The target
+is of all elements of a load: a single one scatters by 1.5 % with 200 draws.
 """
 
 import argparse
@@ -44,12 +43,10 @@ MORE = "more"  # trials that take part in a joint fit, but share its errors and 
 
 OPTIONS = (
     option("--snr-db", default=60.0),
-    option("--samples", default=10_000),
     option("--repetitions", default=200),
     option("--jitter", default=50e-9, help="rms trigger delay [s]"),
     option("--resistors", type=float, nargs="+", help="of the calibrations [ohm]"),
     option("--current-snr-db", type=float, help="identify from a measured current with this noise"),
-    option("--shared", default=False, help="one unloaded record for all"),
     option("--method", nargs="+", choices=ESTIMATORS, help="default: that of the records"),
     option("--more", default=0, help="further trials, for a joint fit"),
     option("--parts", default=0.0, help="draw the parts of the driver with this spread"),
@@ -90,11 +87,6 @@ class Draws(NamedTuple):
     def covered(self) -> np.ndarray:
         """Part of the 95 % intervals that hold the truth."""
         return (np.abs(self.z) < NORMAL_95).mean(0)
-
-    @property
-    def rms(self) -> np.ndarray:
-        """Root mean square of z, 1 if the standard errors are right."""
-        return np.sqrt((self.z**2).mean(0))
 
 
 def scene(
@@ -195,12 +187,12 @@ def lines(name: str, of: Draws, bounds: dict[str, float]) -> Iterator[str]:
     good = of.verdicts == "successful"
     if good.any():
         for i, (element, limit) in enumerate(bounds.items()):
-            error = of.error[good, i]
+            error, z = of.error[good, i], of.z[:, i]
             yield (
                 f"{name:<10}{element:<6}{100 * error.mean():10.3f}{100 * error.std(ddof=1):10.3f}"
                 f"{100 * np.median(of.stderr[good, i]):10.3f}{100 * limit:10.3f}"
-                f"{limit**2 / np.mean(error**2):12.2f}{of.covered[i]:9.3f}{of.rms[i]:7.2f}"
-                f"{np.abs(of.z[:, i]).max():9.1f}"
+                f"{limit**2 / np.mean(error**2):12.2f}{of.covered[i]:9.3f}"
+                f"{np.sqrt(np.mean(z**2)):7.2f}{np.abs(z).max():9.1f}"
             )
         covered, rms = expected_covered(good.sum()), expected_rms(good.sum())
         limited = f"; delays limited in {of.limited.mean():.0%}" if of.limited.any() else ""
@@ -217,12 +209,11 @@ def targets(name: str, of: Draws) -> Iterator[Target]:
     silent = np.sum(np.abs(of.z).max(axis=1, initial=0.0) > SILENT)
     text = f"{silent} of {len(of.verdicts)} fits; {counted(of.verdicts)}"
     first, second = TARGETS
-    yield Target.of(f"{name}: {first}", inside, TARGETS[first])
-    yield Target(f"{name}: {second}", float(silent), *TARGETS[second], text)
+    yield Target.of(TARGETS, first, inside, f"{name}: ")
+    yield Target.of(TARGETS, second, float(silent), f"{name}: ", text=text)
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print one line per load and element; whether every method meets the targets."""
     if arguments.spice is not None:
         truth = json.loads((arguments.data / FOLDER / "truth.json").read_text())
         drawn = scene_of(truth["scenes"][arguments.spice])
@@ -230,12 +221,11 @@ def main(arguments: argparse.Namespace) -> bool:
     else:
         drawn = scene(
             arguments.snr_db,
-            arguments.samples,
+            10_000,
             arguments.resistors or ([REFERENCE] if arguments.current_snr_db is None else []),
             arguments.jitter,
-            arguments.shared,
-            arguments.more,
-            arguments.current_snr_db,
+            more=arguments.more,
+            current_snr_db=arguments.current_snr_db,
         )
     bounds, drivers, asked = etid.bound(drawn), Drivers(), list[Target]()
     print(HEADS)

@@ -23,7 +23,7 @@ from benchmarks.runner import QUICK, option, show
 from etid.estimators.maximum_likelihood.search import WELL
 
 PINNED = True
-OPTIONS = (QUICK, option("--folder", default=pathlib.Path(), type=pathlib.Path))
+OPTIONS = (QUICK, option("--folder", default=pathlib.Path()))
 SAMPLES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 LANES = (1, 4, 16, 64, 256, 1_024, 10_000, 100_000)
 LIMIT = 20.0  # [s] of one call; longer ones end their curve
@@ -123,7 +123,6 @@ def with_slopes(rows: Iterable[Row]) -> Iterator[Row]:
 
 
 def draw(rows: Sequence[Row], path: pathlib.Path) -> None:
-    """One panel per number, legible without colours."""
     figure, panels = charts.new_figure(1, len(AXES), (9.0, 4.2))
     for axes, (against, (across, up)) in zip(panels[0], AXES.items(), strict=True):
         of = [row for row in rows if row["against"] == against]
@@ -139,7 +138,6 @@ def draw(rows: Sequence[Row], path: pathlib.Path) -> None:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Measure, print, and write `curves.csv` and `curves.svg`."""
     table, few = [], slice(3 if arguments.quick else None)
     for row in with_slopes(
         itertools.chain(against_samples(SAMPLES[few]), against_lanes(LANES[few]))

@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+from collections.abc import Sequence
 from typing import Any
 
 import h5py
@@ -14,12 +15,17 @@ Rng = np.random.Generator
 _SPECIAL = (0, 1, 2, 255, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
 
 
+def one_of(rng: Rng, choices: Sequence[Any]) -> Any:
+    """One of several, drawn."""
+    return choices[int(rng.integers(len(choices)))]
+
+
 def damaged(data: bytes, rng: Rng) -> bytes:
     """Flip, overwrite, cut, repeat, move and append bytes, one to four times."""
     found = bytearray(data)
     for _ in range(int(rng.integers(1, 5))):
         if found:
-            _BYTES[rng.integers(len(_BYTES))](found, rng)
+            one_of(rng, _BYTES)(found, rng)
     return bytes(found)
 
 
@@ -82,7 +88,7 @@ _BYTES = (_flip, _set, _number, _number, _cut, _delete, _repeat, _move, _zero, _
 
 def odd_value(rng: Rng) -> Any:
     """A value that no attribute or number of a schema should have."""
-    choices: tuple[Any, ...] = (
+    choices = (
         0, -1, 1, 7, 2**62, np.nan, np.inf, -np.inf, 1e308, 1e-308, -0.0, True, 60.0, 2.0e5,
         "", "x", "volt", "loaded", "calibration", "/", "../..", "a\tb", "Ω", "x" * 5000,
         np.bytes_(b"\xff\xfe"), [1.0, 2.0], [1, 2, 3], ["a", "b"], np.zeros((2, 2)),
@@ -90,7 +96,7 @@ def odd_value(rng: Rng) -> Any:
         h5py.Empty("f8"), h5py.Empty("S3"), np.longdouble(1), np.float16(3),
         np.array([b"s01/dry"]), np.void(b"abc"), np.uint64(2**64 - 1),
     )  # fmt: skip
-    return choices[int(rng.integers(len(choices)))]
+    return one_of(rng, choices)
 
 
 def damaged_json(text: str, rng: Rng) -> str:
@@ -101,14 +107,13 @@ def damaged_json(text: str, rng: Rng) -> str:
         depth = int(rng.choice([10, 1000, 100_000]))
         return "[" * depth + "]" * depth
     content = json.loads(text)
-    keys = list(content)
-    key = keys[int(rng.integers(len(keys)))]
+    key = one_of(rng, list(content))
     odd = (None, 0, -1, 2.5, 1e308, True, "x", [], {}, [1.0], [[1.0]], ["a"], {"a": [1]}, 10**30,
            [[1.0], [2.0, 3.0]], float("nan"), [None], "successful")  # fmt: skip
     if rng.random() < 0.2:
         del content[key]
     else:
-        content[key] = odd[int(rng.integers(len(odd)))]
+        content[key] = one_of(rng, odd)
     return json.dumps(content)
 
 
@@ -125,7 +130,7 @@ def damaged_npz(data: bytes, rng: Rng) -> bytes:
     elif what < 0.5:
         members[name] = damaged(members[name], rng)
     elif what < 0.7:
-        shape = ((2**40,), (2**33, 100), (10**9,), (-1,), (3, -4), (2**70,))[int(rng.integers(6))]
+        shape = one_of(rng, [(2**40,), (2**33, 100), (10**9,), (-1,), (3, -4), (2**70,)])
         header = f"{{'descr': '<i2', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
         members[name] = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
     else:
@@ -148,7 +153,7 @@ def damaged_text(data: bytes, rng: Rng) -> bytes:
     place = int(rng.integers(min(len(lines), 12)))
     odd = (b"", b",,,,", b'"', b"nan,inf,-inf", b"1e999,1,1", b"1,2", b"1,2,3,4", b"\xff\xfe", b"a",
            b"\0\0", b"1;2;3", b"0x10,1,1", b"9" * 5000, b'"' + b"x" * 200_000)  # fmt: skip
-    lines[place] = odd[int(rng.integers(len(odd)))]
+    lines[place] = one_of(rng, odd)
     return b"\n".join(lines)
 
 
@@ -157,8 +162,7 @@ def damaged_toml(data: bytes, rng: Rng) -> bytes:
     if rng.random() < 0.4:
         return damaged_text(data, rng)
     lines = data.decode().splitlines()
-    places = [number for number, line in enumerate(lines) if "=" in line]
-    place = places[int(rng.integers(len(places)))]
+    place = one_of(rng, [number for number, line in enumerate(lines) if "=" in line])
     depth = int(rng.choice([3, 300, 30_000]))
     values = (
         "[" * depth + "]" * depth, "{a=" * depth + "1" + "}" * depth, "1" + "0" * 400, "1" * 6000,
@@ -170,7 +174,7 @@ def damaged_toml(data: bytes, rng: Rng) -> bytes:
     key = lines[place].partition("=")[0]
     if rng.random() < 0.15:
         key = ".".join(["a"] * depth)
-    lines[place] = f"{key} = {values[int(rng.integers(len(values)))]}"
+    lines[place] = f"{key} = {one_of(rng, values)}"
     if rng.random() < 0.1:
         lines += ["[[recording]]", "path = 'x'"] * int(rng.choice([2, 3000]))
     return "\n".join(lines).encode()

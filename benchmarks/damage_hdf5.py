@@ -8,7 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from benchmarks.damage import Rng, damaged_json, odd_value
+from benchmarks.damage import Rng, damaged_json, odd_value, one_of
 
 _NAMES = ("v_th", "v_out", "current", "kind", "unit", "conversion", "path", "cov", "verdict", "x")
 _BOMB = 1 << 27  # numbers in a dataset that takes a few kilobytes of the file
@@ -20,12 +20,11 @@ def restructure(path: pathlib.Path, rng: Rng) -> None:
         for _ in range(int(rng.integers(1, 4))):
             # What the library refuses to write is no file to read.
             with contextlib.suppress(Exception):
-                _STRUCTURE[rng.integers(len(_STRUCTURE))](file, rng)
+                one_of(rng, _STRUCTURE)(file, rng)
 
 
 def _any(file: h5py.File, rng: Rng, kind: type) -> Any:
-    found = [item for item in _items(file) if isinstance(item, kind)]
-    return found[int(rng.integers(len(found)))]
+    return one_of(rng, [item for item in _items(file) if isinstance(item, kind)])
 
 
 def _items(file: h5py.File) -> Iterator[h5py.HLObject]:
@@ -63,21 +62,21 @@ def _shape(file: h5py.File, rng: Rng) -> None:
     dtype = dataset.dtype
     if rng.random() < 0.4:  # declared, but not stored
         huge = [(2**20,), (2**31,), (2**40,), (2**31, 2**31), (2**40, 100), (10, 2**33), (2**21, 4)]
-        shape = huge[int(rng.integers(len(huge)))]
+        shape = one_of(rng, huge)
         chunks = tuple(min(64, side) for side in shape)
         return _replaced(dataset, shape=shape, dtype=dtype, chunks=chunks)
-    return _replaced(dataset, shape=shapes[int(rng.integers(len(shapes)))], dtype=dtype)
+    return _replaced(dataset, shape=one_of(rng, shapes), dtype=dtype)
 
 
 def _dtype(file: h5py.File, rng: Rng) -> None:
     dataset = _any(file, rng, h5py.Dataset)
     texts = h5py.string_dtype()
-    kinds: tuple[Any, ...] = (
+    kinds = (
         "f2", "f4", ">f8", ">i2", "u1", "i8", "c16", "S5", "V7", texts, np.dtype("longdouble"),
         h5py.enum_dtype({"a": 1, "b": 2}), h5py.vlen_dtype("f8"), h5py.ref_dtype, "bool",
         np.dtype([("a", "i4"), ("b", "f8")]), h5py.string_dtype("utf-8", 3), ("f8", (4,)),
     )  # fmt: skip
-    _replaced(dataset, shape=dataset.shape, dtype=kinds[int(rng.integers(len(kinds)))])
+    _replaced(dataset, shape=dataset.shape, dtype=one_of(rng, kinds))
 
 
 def _values(file: h5py.File, rng: Rng) -> None:
@@ -93,15 +92,14 @@ def _values(file: h5py.File, rng: Rng) -> None:
         dataset[...] = stored
     else:
         texts = ["", "x", "successful", "mixed", "{}", "[]", '{"calibrations": 1}', "loaded/0"]
-        dataset[int(rng.integers(len(dataset)))] = texts[int(rng.integers(len(texts)))]
+        dataset[int(rng.integers(len(dataset)))] = one_of(rng, texts)
 
 
 def _json(file: h5py.File, rng: Rng) -> None:
     """Change the text of drivers, or of any other dataset of texts."""
     datasets = [item for item in _items(file) if isinstance(item, h5py.Dataset)]
     texts = [item for item in datasets if h5py.check_string_dtype(item.dtype)]
-    named = [each for each in texts if each.name == "/drivers"] or texts
-    dataset: Any = named[int(rng.integers(len(named)))]
+    dataset = one_of(rng, [each for each in texts if each.name == "/drivers"] or texts)
     row = int(rng.integers(len(dataset)))
     dataset[row] = damaged_json(dataset.asstr()[row], rng)
 
@@ -119,7 +117,7 @@ def _rename(file: h5py.File, rng: Rng) -> None:
 def _attribute(file: h5py.File, rng: Rng) -> None:
     owner = _any(file, rng, h5py.HLObject)
     names = list(owner.attrs)
-    name = names[int(rng.integers(len(names)))] if names else "kind"
+    name = one_of(rng, names) if names else "kind"
     what = rng.random()
     if what < 0.2:
         del owner.attrs[name]
@@ -168,7 +166,7 @@ def _link(file: h5py.File, rng: Rng) -> None:
     name = str(rng.choice(_NAMES))
     if name in group:
         del group[name]
-    links: tuple[Any, ...] = (
+    links = (
         item,
         h5py.SoftLink(item.name),
         h5py.SoftLink(group.name + "/" + name),  # to itself
@@ -177,7 +175,7 @@ def _link(file: h5py.File, rng: Rng) -> None:
         h5py.ExternalLink("/dev/zero", "/"),
         h5py.ExternalLink("/nowhere.h5", "/"),
     )
-    group[name] = links[int(rng.integers(len(links)))]
+    group[name] = one_of(rng, links)
 
 
 def _elsewhere(file: h5py.File, rng: Rng) -> None:

@@ -60,7 +60,6 @@ def covered_after_dropping(
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print the tables."""
     rng = np.random.default_rng(0)
     print("bounds of R_s, R_p, C_p in %: delays open, one for both records, none")
     print("intervals that contain the truth after dropping small delays, and part dropped")

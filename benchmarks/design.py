@@ -37,7 +37,6 @@ def error(pulse_rate: float, load: str) -> dict[str, float]:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print the bounds over the rate, and the rate that is best for R_s."""
     del arguments
     for load in LOADS:
         print(f"{load}: bounds in % of r_s, r_p, c_p")

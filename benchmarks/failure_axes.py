@@ -136,7 +136,6 @@ class Clipped:
     sigma: float = 0.0
 
     def __call__(self, recording: Recording, rng: np.random.Generator) -> Recording:
-        """The recording, clipped."""
         limit = float(np.quantile(np.abs(recording.v_th), 1 - self.part))
 
         def clip(v: np.ndarray) -> np.ndarray:
@@ -162,7 +161,6 @@ class Coloured:
     rms: float  # its effective value [V]
 
     def __call__(self, recording: Recording, rng: np.random.Generator) -> Recording:
-        """The recording, with more noise."""
 
         def add(v: np.ndarray) -> np.ndarray:
             low, high = self.band
@@ -214,7 +212,6 @@ def transformer(order: int) -> TransformerDriver:
 
 
 def cells() -> Iterator[Cell]:
-    """All cells, map by map."""
     for snr in SNR_DB:
         row, db = f"{snr} dB", float(snr)
         for ratio in RATIOS:

@@ -16,17 +16,16 @@ import numpy as np
 from jaxtyping import Array
 
 import etid
-from benchmarks.estimators import DEFAULT, NOTHING, Answer, Drivers, fits
-from benchmarks.failure_axes import Cell, Cole, TwoLayers
-from benchmarks.machine import make_room
+from benchmarks.estimators import DEFAULT, NOTHING, Answer, Drivers, fits, found_by
+from benchmarks.failure_axes import Cell, Cole
 from benchmarks.selection_draws import choices
-from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
+from etid.circuits.circuit import Resistor, SkinRC
 from etid.estimators.registry import named
 from etid.results.driver import DiscreteDriver
 from etid.results.fit import Fit
 from etid.signals.transfer import is_stable
 from etid.simulation.scenes import Scene
-from etid.simulation.transformer import Impedance, SkinLoad
+from etid.simulation.transformer import SkinLoad
 
 AUTO = "auto"  # the name of `circuit="auto"` among the methods
 NOT_CONVERGED = ("max_steps_reached", "nonfinite")
@@ -39,12 +38,9 @@ class Effort(NamedTuple):
     trials: int
 
 
-def elements(load: Impedance | AbstractCircuit) -> SkinLoad:
+def elements(load: Any) -> SkinLoad:
     """The true elements of a load of these scenes."""
-    if isinstance(load, TwoLayers | Cole):
-        return load.elements
-    assert isinstance(load, SkinLoad)
-    return load
+    return getattr(load, "elements", load)
 
 
 def bounds(scene: Scene) -> dict[str, np.ndarray]:
@@ -64,7 +60,6 @@ def seeds(cell: Cell, count: int) -> Iterator[int]:
 
 
 def recordings(cell: Cell, seed: int) -> tuple[list[etid.Recording], list[etid.Recording]]:
-    """Calibrations and trials of one seed."""
     rng = np.random.default_rng([seed, *b"change"])
     every = list(cell.scene.simulate(seed).recordings())
     every = every if cell.change is None else [cell.change(record, rng) for record in every]
@@ -94,12 +89,13 @@ def limits(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(found(values)), np.sqrt(np.diagonal(slopes @ np.asarray(fit.cov) @ slopes.T))
 
 
-def judged(cell: Cell, name: str, seed: int, path: str, fit: Fit, bound: np.ndarray) -> Answer:
-    """What a fit says of one trial."""
-    load = next(trial.load for trial in cell.scene.trials if trial.path == path)
+def judged(cell: Cell, none: Answer, fit: Fit, driver: etid.Driver) -> Answer:
+    """What a fit says of one trial; `none` is the answer without it."""
+    load = next(trial.load for trial in cell.scene.trials if trial.path == none.path)
     true, exact = elements(load), isinstance(load, SkinLoad) and cell.circuit is None
-    if name == AUTO:
-        truth, (value, stderr) = np.array(dataclasses.astuple(true)), limits(fit)
+    truth = np.array(dataclasses.astuple(true))
+    if none.method == AUTO:
+        value, stderr = limits(fit)
         exact = exact and isinstance(fit.circuit, SkinRC)
     elif isinstance(fit.circuit, Resistor):
         truth, value, stderr = (
@@ -107,15 +103,18 @@ def judged(cell: Cell, name: str, seed: int, path: str, fit: Fit, bound: np.ndar
             for r in (true.r_s + true.r_p, fit.circuit.r, fit.stderr.r)
         )
     else:
-        truth = np.array(dataclasses.astuple(true))
-        value, stderr = (np.asarray(of.values()) for of in (fit.circuit, fit.stderr))
-    return Answer(
-        *(name, seed, path, fit.verdict),
+        value, stderr, _ = found_by(fit)
+    words = fit.verdict, driver.verdict
+    discrete = isinstance(driver, DiscreteDriver) and not bool(is_stable(driver.a))
+    return dataclasses.replace(
+        none,
+        verdict=fit.verdict,
         error=value / truth - 1,
         stderr=stderr / truth,
-        bound=bound,
         chi2=float(fit.chi2),
         exact=exact,
+        unstable=discrete or "unstable" in words,
+        unsettled=any(word in NOT_CONVERGED for word in words),
     )
 
 
@@ -128,34 +127,24 @@ def said(
     bound: Mapping[str, np.ndarray],
 ) -> Iterator[Answer]:
     """What a method says of some trials of one seed."""
-    if driver is None:
-        for one in records:
-            yield Answer(name, seed, one.path, "driver_failed", NOTHING, NOTHING, bound[one.path])
-        return
-    discrete = isinstance(driver, DiscreteDriver) and not bool(is_stable(driver.a))
-    if name == AUTO:
-        found: Any = [one.fit for one in choices(records, driver)]
-    else:
-        found = fits(records, driver, name, cell.circuit)
-    for path, fit in zip((record.path for record in records), found, strict=True):
-        words = fit.verdict, driver.verdict
-        yield dataclasses.replace(
-            judged(cell, name, seed, path, fit, bound[path]),
-            unstable=discrete or "unstable" in words,
-            unsettled=any(word in NOT_CONVERGED for word in words),
-        )
+    found: Sequence[Fit | None] = (
+        [one.fit for one in choices(records, driver)]
+        if name == AUTO and driver is not None
+        else fits(records, driver, name, cell.circuit)
+    )
+    for one, fit in zip(records, found, strict=True):
+        none = Answer(name, seed, one.path, "driver_failed", NOTHING, NOTHING, bound[one.path])
+        yield none if fit is None or driver is None else judged(cell, none, fit, driver)
 
 
 def answers(cell: Cell, efforts: Mapping[str, Effort]) -> list[Answer]:
     """All answers in a cell, by the methods of `efforts`."""
-    with jax.enable_x64(True):  # of a worker process
-        bound, found = bounds(cell.scene), list[Answer]()
-        for number, seed in enumerate(seeds(cell, max(e.drivers for e in efforts.values()))):
-            (calibrations, trials), drivers = recordings(cell, seed), Drivers(cell.order)
-            for name, of in efforts.items():
-                able = cell.circuit is None or name == DEFAULT or named(name).any_circuit
-                if able and number < of.drivers:
-                    driver = drivers.of(calibrations, DEFAULT if name == AUTO else name)
-                    found += said(cell, seed, name, trials[: of.trials], driver, bound)
-        make_room()
-        return found
+    bound, found = bounds(cell.scene), list[Answer]()
+    for number, seed in enumerate(seeds(cell, max(e.drivers for e in efforts.values()))):
+        (calibrations, trials), drivers = recordings(cell, seed), Drivers(cell.order)
+        for name, of in efforts.items():
+            able = cell.circuit is None or name == DEFAULT or named(name).any_circuit
+            if able and number < of.drivers:
+                driver = drivers.of(calibrations, DEFAULT if name == AUTO else name)
+                found += said(cell, seed, name, trials[: of.trials], driver, bound)
+    return found

@@ -1,22 +1,19 @@
 """Where each method fails, and whether it says so: maps over nine pairs of axes.
 
-For each method and cell: the rate of wrong answers, of those that are wrong silently, of unstable
-poles, and of iterations that did not converge, with 95 % intervals (`benchmarks.estimators` defines
-wrong and silent, `benchmarks.rates` the intervals). Written are `failures.csv`, one row for each
-cell and method; `silent_failures.csv`, each silent failure with its seed; and one
-`failures_NUMBER.svg` for each map.
+`benchmarks.estimators` defines wrong and silent, `benchmarks.rates` the intervals. Written are
+`failures.csv`, one row for each cell and method; `silent_failures.csv`, each silent failure with
+its seed; and one `failures_NUMBER.svg` for each map.
 
-The targets are of the default method: how often it is silently wrong about an element that is
-determined to 10 %, of the trials that have such an element. In a single cell the lower end of the
-interval counts. Output error takes ten times as long as all other methods together, and gets fewer
-draws, as does what takes longer because of a higher sample rate or more periods.
+The targets are of the default method, and of the trials that have an element which is determined to
+10 %. In a single cell the lower end of the interval counts. What takes longer (output error, a
+higher sample rate, more periods) gets fewer draws.
 """
 
 import argparse
 import collections
 import itertools
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,7 +35,6 @@ TARGETS = {
 ALL = 2 * MOST  # trials of a driver
 DRIVERS = 3  # an hour on two cores
 USUAL = 10_000.0  # samples of three periods at 200 kHz
-CHUNK = 8  # cells of one task
 # Of the quick run: two where all is well for the default method and not for the others, and one
 # where another skin has to be noticed.
 FEW = {
@@ -63,32 +59,9 @@ def effort(cell: Cell, quick: bool, drivers: int) -> dict[str, Effort]:
     return {name: Effort(max(1, round(of.drivers / cost)), of.trials) for name, of in usual.items()}
 
 
-def chunk(
-    chosen: Sequence[Cell], efforts: Sequence[Mapping[str, Effort]]
-) -> list[tuple[Cell, list[Answer]]]:
-    """Several cells with their answers."""
-    return [(cell, answers(cell, of)) for cell, of in zip(chosen, efforts, strict=True)]
-
-
-def tasks(chosen: Sequence[Cell]) -> list[list[Cell]]:
-    """Cells that are done by one process: of one shape, so that it compiles once."""
-    by_shape = collections.defaultdict(list)
-    for cell in chosen:
-        by_shape[cell.shape].append(cell)
-    found = []
-    for same in by_shape.values():
-        size = CHUNK if len(same) > 4 * CHUNK else len(same)
-        found += [same[i : i + size] for i in range(0, len(same), size)]
-    return sorted(found, key=lambda of: -sum(cell.scene.samples for cell in of))
-
-
-EVENTS: Mapping[str, Callable[[Answer], bool]] = {
-    "wrong": lambda answer: answer.wrong,
-    "refused": lambda answer: answer.refused,
-    "silent": lambda answer: answer.silent,
-    "unstable": lambda answer: answer.unstable,
-    "not_converged": lambda answer: answer.unsettled,
-}
+# Columns of the table, and what they count.
+EVENTS = {name: name for name in ("wrong", "refused", "silent", "unstable")}
+EVENTS["not_converged"] = "unsettled"
 
 
 def rates(given: Iterable[Answer]) -> dict[str, Any]:
@@ -98,7 +71,9 @@ def rates(given: Iterable[Answer]) -> dict[str, Any]:
     """
     every = list(given)
     asked, seeds_of = [a for a in every if a.target], [a.seed for a in every]
-    of = {name: rate([event(a) for a in every], seeds_of) for name, event in EVENTS.items()}
+    of = {
+        name: rate([getattr(a, event) for a in every], seeds_of) for name, event in EVENTS.items()
+    }
     of["missed"] = rate([a.missed for a in asked], [a.seed for a in asked])
     found: dict[str, Any] = {"drivers": len({*seeds_of}), "trials": len(every)}
     found["determined"] = len(asked)
@@ -139,11 +114,11 @@ def targets(rows: Sequence[Mapping[str, Any]], every: Sequence[Answer]) -> Itera
     for row in rows:
         if row["method"] == DEFAULT and row["missed_low"] > TARGETS[single][1]:
             place = ", ".join(row[name] for name in ("map", "row", "column"))
-            yield Target(f"{single}: {place}", row["missed_low"], *TARGETS[single])
+            yield Target.of(TARGETS, single, row["missed_low"], after=f": {place}")
     asked = [a for a in every if a.method == DEFAULT and a.target]
     if asked:
         missed = rate([a.missed for a in asked], [a.seed for a in asked])
-        yield Target.of(overall, missed, TARGETS[overall])
+        yield Target.of(TARGETS, overall, missed)
 
 
 def ranking(every: Sequence[Answer]) -> Iterator[Target]:
@@ -186,28 +161,26 @@ def draw(rows: Rows, path: pathlib.Path) -> None:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Draw, count, print, and write tables and pictures."""
     quick, folder = arguments.quick, arguments.folder
     chosen = [of for of in cells() if not quick or tuple(of.place.values()) in FEW]
-    given = [(of, [effort(cell, quick, arguments.drivers) for cell in of]) for of in tasks(chosen)]
-    number = {tuple(cell.place.values()): i for i, cell in enumerate(chosen)}
+    tasks = [(cell, effort(cell, quick, arguments.drivers)) for cell in chosen]
 
-    def in_order(done: Iterable[list[tuple[Cell, list[Answer]]]]) -> list[tuple[Cell, list]]:
-        pairs = [pair for found in done for pair in found]
-        return sorted(pairs, key=lambda pair: number[tuple(pair[0].place.values())])
+    def counted(done: Mapping[int, list[Answer]]) -> list[dict[str, Any]]:
+        return [row for number, of in done.items() for row in table(chosen[number], of)]
 
-    def counted(done: Mapping[int, list[tuple[Cell, list[Answer]]]]) -> list[dict[str, Any]]:
-        return [row for pair in in_order(done.values()) for row in table(*pair)]
-
-    settings = {"workers": arguments.workers, "keep": "failure_map"}
-    found = in_order(tabled(folder / RATES, counted, chunk, given, **settings))
-    rows = [row for pair in found for row in table(*pair)]
-    failures = [row for pair in found for row in silent(*pair)]
+    found = tabled(
+        folder / RATES, counted, answers, tasks,
+        workers=arguments.workers, unit="cell", keep="failure_map",
+        # The longest first, and one shape after the other: a process compiles for each.
+        first=lambda cell, _: (-cell.scene.samples, cell.shape),
+    )  # fmt: skip
+    rows = counted(dict(enumerate(found)))
+    failures = [row for cell, of in zip(chosen, found, strict=True) for row in silent(cell, of)]
     write_csv(folder / SILENT, failures)
     for name in dict.fromkeys(row["map"] for row in rows):
         of = [row for row in rows if row["map"] == name]
         draw(of, folder / f"failures_{MAPS.index(name) + 1}.svg")
-    every = [answer for _, answered in found for answer in answered]
+    every = [answer for answered in found for answer in answered]
     for name in dict.fromkeys(answer.method for answer in every):
         of = [answer for answer in every if answer.method == name]
         verdicts = collections.Counter(answer.verdict for answer in of)

@@ -29,6 +29,7 @@ import numpy as np
 
 import etid
 from benchmarks import specimens
+from benchmarks.damage import one_of
 from benchmarks.runner import option, show
 
 MEMORY = 1 << 30  # bytes that a process may have in memory
@@ -51,7 +52,6 @@ OPTIONS = (
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Run them; whether nothing crashed, hung, ate memory or raised what is not ours."""
     started = time.perf_counter()
     seeds = range(arguments.first, arguments.first + arguments.files)
     cases = [(arguments.kind or kind_of(seed), seed) for seed in seeds]
@@ -158,7 +158,7 @@ def damage(path: pathlib.Path, kind: specimens.Kind, seed: int) -> pathlib.Path:
     """Write a damaged file of this kind and seed into a folder."""
     rng = np.random.default_rng(seed)
     name = path / f"{seed}{kind.suffix}"
-    name.write_bytes(kind.good[int(rng.integers(len(kind.good)))])
+    name.write_bytes(one_of(rng, kind.good))
     kind.damage(name, rng)
     return name
 

@@ -49,7 +49,6 @@ def rung(load: str, **settings: Any) -> Scene:
 
 
 def ladder() -> Mapping[str, Scene]:
-    """All rungs by name."""
     rungs = {f"{load}, {snr} dB": rung(load, snr_db=float(snr)) for load in LOADS for snr in SNR_DB}
     for count, samples in PERIODS.items():
         rungs[f"dry, {count} period{'s' if count > 1 else ''}"] = rung("dry", samples=samples)

@@ -42,7 +42,7 @@ OPTIONS = (
     option("--electrodes", default=98),
     option("--minutes", default=10.0),
     option("--windows", default=2, help="readers of the page"),
-    option("-o", "--output", type=pathlib.Path, default=RESULTS / "live.csv"),
+    option("-o", "--output", default=RESULTS / "live.csv"),
 )
 
 
@@ -59,7 +59,6 @@ class Timed(LiveView):
     last = 0.0
 
     def show(self, tick: Tick) -> None:
-        """Hand over a tick."""
         due, wall, busy = self._due, time.perf_counter(), time.process_time()
         super().show(tick)
         now = time.process_time()
@@ -69,7 +68,6 @@ class Timed(LiveView):
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print the table and write it; whether all targets are met."""
     tracker, pulses = problem(arguments.electrodes)
     controller = etid.Controller.of(tracker)
     period = tracker.period / tracker.model.bands.sample_rate
@@ -116,11 +114,7 @@ def main(arguments: argparse.Namespace) -> bool:
         "growth of the loop's memory [MB]": grown[0],
         "growth of the page's memory [MB]": grown[1],
     }
-    limits = (TARGETS.get(name, (np.nan, np.nan)) for name in numbers)
-    found = [
-        Target(name, float(value), *of)
-        for (name, value), of in zip(numbers.items(), limits, strict=True)
-    ]
+    found = [Target.of(TARGETS, name, float(value)) for name, value in numbers.items()]
     return report(found, arguments.output)
 
 

@@ -27,7 +27,6 @@ MAPPINGS = 30_000  # half of what Linux allows; one test file needs a few thousa
 
 
 def provenance() -> dict[str, str]:
-    """Commit, machine and versions."""
     return {
         "commit": _commit(),
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",

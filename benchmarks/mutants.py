@@ -1,12 +1,9 @@
 """Changes of a module that its tests should notice, one at a time.
 
-A mutant is one changed expression or statement: another operator, comparison or constant, a dropped
-term, a negated condition, swapped arguments, a deleted statement. Annotations, docstrings, texts,
-`assert`s for the type checker and decorators are left alone: what they change no test should see.
-Nor is anything done that changes nothing by construction. The arguments of a function that does not
-know their order are not swapped. `zip(..., strict=True)` stays, as only a bug would notice it.
-Three times a tiny constant is as tiny, so it becomes 1. `os.sched_setaffinity` is left alone, too:
-a mutant of it could act on other processes of this machine.
+Annotations, docstrings, texts, `assert`s for the type checker and decorators are left alone: what
+they change no test should see. So is what changes nothing by construction: the order of arguments
+of a function that does not know it, and `zip(..., strict=True)`. Three times a tiny constant is as
+tiny, so it becomes 1. A mutant of `os.sched_setaffinity` could act on other processes.
 """
 
 import ast
@@ -98,15 +95,10 @@ def _parts(node: ast.AST, inside: bool = False) -> Iterator[tuple[ast.AST, bool]
 
 
 def _is_silent(node: ast.AST) -> bool:
-    match node:
-        case ast.Assert() | ast.Raise() | ast.Import() | ast.ImportFrom() | ast.JoinedStr():
-            return True
-        case ast.keyword(arg="strict"):
-            return True
-        case ast.Call(func=ast.Attribute(attr="sched_setaffinity")):
-            return True
-        case _:
-            return False
+    silent = ast.Assert | ast.Raise | ast.Import | ast.ImportFrom | ast.JoinedStr
+    affinity = isinstance(node, ast.Call) and "sched_setaffinity" in ast.unparse(node.func)
+    strict = isinstance(node, ast.keyword) and node.arg == "strict"
+    return affinity or strict or isinstance(node, silent)
 
 
 def mutants(path: str, source: str) -> list[Mutant]:
@@ -143,6 +135,6 @@ def _compiles(source: str) -> bool:
 
 def drawn(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
     """As many of them as were asked for; the first of them are what a smaller number draws."""
-    order = list(range(len(every)))
+    order = list(every)
     random.Random(seed).shuffle(order)
-    return [every[i] for i in order[:count]]
+    return order[:count]

@@ -1,15 +1,14 @@
 """Would the tests tell? Bugs are put in, one at a time, and the tests that execute them run.
 
 Mutants (`benchmarks.mutants`) are drawn by a seed from all modules of etid, in a copy of the
-working tree. First every file of the ordinary tests runs once, in a process of its own, and its
-executed lines are noted. A mutant is then judged by all files that execute its line; one outside of
-functions, by all files that execute any function of the module. Tests that killed a mutant of the
-module come first, then the fastest files. A mutant that all of them let pass has survived, and so
-has one that no test executes. Some are no bug at all; they are counted all the same.
+working tree. First every file of the ordinary tests runs once, and its executed lines are noted. A
+mutant is then judged by all files that execute its line; one outside of functions, by all files
+that execute any function of the module. What all of them let pass has survived, and so has what no
+test executes. Some mutants are no bug at all; they are counted all the same. They are done in the
+order in which they were drawn: what is done is a fair sample.
 
-Mutants are done in the order in which they were drawn: what is done is a fair sample. mutmut wraps
-every function, which compiled code and checks of types see, and cosmic-ray starts Python and JAX
-anew for each mutant and runs the same tests for all.
+mutmut wraps every function, which compiled code and checks of types see, and cosmic-ray starts
+Python and JAX anew for each mutant and runs the same tests for all.
 """
 
 import argparse
@@ -29,7 +28,7 @@ from typing import Any, NamedTuple
 from benchmarks.machine import ROOT
 from benchmarks.mutants import Mutant, drawn, mutants
 from benchmarks.rates import clopper_pearson
-from benchmarks.runner import Target, at_most, each, option, report, tabled
+from benchmarks.runner import Target, at_most, each, option, report, show, tabled
 
 TARGETS = {"mutants that survive": at_most(0.1)}
 COPIED = (
@@ -139,7 +138,7 @@ class Tree:
             raise SystemExit(f"{test} fails without any mutant: {found.killer}")
         return time.perf_counter() - begun, found.lines
 
-    def outcome(self, mutant: Mutant, tests: Sequence[str], limit: float) -> dict[str, Any]:
+    def outcome(self, mutant: Mutant, tests: Sequence[str]) -> dict[str, Any]:
         """The row of a mutant."""
         path, begun = self.folder / mutant.path, time.perf_counter()
         source, module = path.read_text("utf-8"), mutant.path.removesuffix(".py").replace("/", ".")
@@ -147,7 +146,7 @@ class Tree:
         self.times += 1
         # Python takes bytecode for that of a source of the same length and time.
         os.utime(path, (self.times, self.times))
-        passed, killer, _ = self.judged(tests, module, limit) if tests else Judged(True, "", {})
+        passed, killer, _ = self.judged(tests, module, LIMIT) if tests else Judged(True, "", {})
         path.write_text(source, "utf-8")
         return {
             "module": module.removeprefix("etid."),
@@ -176,42 +175,30 @@ def judges(
     return sorted(of, key=lambda test: of[test])
 
 
-def show(rows: Sequence[Mapping[str, Any]]) -> Target:
-    """Print what survived; the part of all that it is."""
-    counts = collections.Counter(row["module"] for row in rows)
+def survived(rows: Sequence[Mapping[str, Any]]) -> Target:
+    """The part of the mutants that survived, which are printed."""
     left = [row for row in rows if row["outcome"] != "killed"]
-    survived = collections.Counter(row["module"] for row in left)
-    print(f"{'module':<44}{'mutants':>8}{'survived':>10}")
-    for name, count in sorted(counts.items()):
-        print(f"{name:<44}{count:>8}{survived[name]:>10}")
     for row in left:
         print(f"  {row['place']}: {row['kind']}: {row['before'][:70]}  ->  {row['after'][:70]}")
-    [(name, limits)] = TARGETS.items()
+    [name] = TARGETS
     share, interval = len(left) / len(rows), clopper_pearson(len(left), len(rows))
-    text = "{} of {}, {:.0%} (95 %: {:.0%} to {:.0%})".format(
-        len(left), len(rows), share, *interval
-    )
-    return Target(name, share, *limits, text, interval)
-
-
-def module_names(root: pathlib.Path) -> list[str]:
-    """All modules of etid, by their names below it."""
-    found = sorted((root / "etid").rglob("*.py"))
-    return [".".join(path.relative_to(root / "etid").with_suffix("").parts) for path in found]
+    low, high = interval
+    text = f"{len(left)} of {len(rows)}, {share:.0%} (95 %: {low:.0%} to {high:.0%})"
+    return Target.of(TARGETS, name, share, text=text, interval=interval)
 
 
 OPTIONS = (
     option("--mutants", default=40, help="how many to draw"),
     option("--modules", nargs="+", type=str, default=[], metavar="MODULE", help="of etid; all"),
     option("--seed", default=0),
-    option("--limit", default=LIMIT, help="time of a mutant [s]"),
-    option("--output", default=pathlib.Path("mutation.csv"), type=pathlib.Path),
+    option("--output", default=pathlib.Path("mutation.csv")),
 )
 
 
 def main(arguments: argparse.Namespace, root: pathlib.Path = ROOT) -> bool:
-    """Draw, judge, print and write; whether few enough mutants survive."""
-    names, every, calls = arguments.modules or module_names(root), list[Mutant](), {}
+    below = [path.relative_to(root / "etid") for path in sorted((root / "etid").rglob("*.py"))]
+    names = arguments.modules or [".".join(path.with_suffix("").parts) for path in below]
+    every, calls = list[Mutant](), {}
     for name in names:
         path = f"etid/{name.replace('.', '/')}.py"
         of = mutants(path, (root / path).read_text("utf-8"))
@@ -230,13 +217,10 @@ def main(arguments: argparse.Namespace, root: pathlib.Path = ROOT) -> bool:
 
         def outcome(mutant: Mutant) -> dict[str, Any]:
             by = judges(mutant, executed, calls[mutant.path])
-            row = tree.outcome(mutant, [*killers[mutant.path], *by], arguments.limit)
+            row = tree.outcome(mutant, [*killers[mutant.path], *by])
             if row["killer"] and row["killer"] not in killers[mutant.path]:
                 killers[mutant.path].append(row["killer"])
-            print(
-                f"{row['place']:<52}{row['kind']:<20}{row['outcome']:<10}{row['seconds']:6.1f} s",
-                flush=True,
-            )
+            show(row, "place", "kind", "outcome", "seconds")
             return row
 
         def table(done: dict[int, dict[str, Any]]) -> list[dict[str, Any]]:
@@ -245,4 +229,4 @@ def main(arguments: argparse.Namespace, root: pathlib.Path = ROOT) -> bool:
         tasks = [(mutant,) for mutant in chosen]
         keep = "mutation" if kept else ""
         rows = tabled(arguments.output, table, outcome, tasks, unit="mutant", keep=keep)
-    return report([show(rows)])
+    return report([survived(rows)])

@@ -1,16 +1,14 @@
 """An independent referee: the transformer of a scene solved by ngspice, step by step in time.
 
-`record(scene, seed)` stands in for `scene.simulate(seed)`. The waveform comes from ngspice (Debian
-package `ngspice`), the recorder is the scene's own, with the same draws. The two studies differ by
-the simulator alone. One run per circuit and load, kept in memory and in `CACHE`, serves all draws
-of noise; it takes half a second.
+`record(scene, seed)` stands in for `scene.simulate(seed)`: the waveform comes from ngspice (Debian
+package `ngspice`), the recorder is the scene's own, with the same draws. One run per circuit and
+load, kept in memory and in `CACHE`, serves all draws of noise.
 
 ngspice chooses its own steps, which RELTOL bounds. With 1e-8 the largest deviation from
-`Scene.waveform` is 6.2e-6 of the peak, after the anti-alias filter of 80 kHz, which moves R_s, R_p
-and C_p of a dry and a damp fingertip at 60 dB by 0.003 % (22 circuits, elements spread by 30 %,
-converter without rounding). With 1e-9 one of them ends with "timestep too small". A 16-bit
-converter rounds a few of a hundred samples to the other code, which moves the elements by a tenth
-of their standard errors.
+`Scene.waveform` is 6.2e-6 of the peak, which moves R_s, R_p and C_p at 60 dB by 0.003 % (22
+circuits, elements spread by 30 %, no rounding to codes). With 1e-9 one of them ends with "timestep
+too small". A 16-bit converter rounds a few of a hundred samples to the other code, which moves the
+elements by a tenth of their standard errors.
 """
 
 import functools
@@ -61,9 +59,6 @@ def netlist(driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_
 
     The windings are an ideal transformer 1:n between m and w, with the leakage, magnetising and
     loss elements of each side around it.
-
-    Raises:
-        ValueError: ngspice cannot have this load or this pulse.
     """
     if not 0 < driver.edge < driver.width:
         raise ValueError(
@@ -120,12 +115,7 @@ def _text(*numbers: float) -> str:
 
 
 def record(scene: Scene, seed: int) -> etid.Study:
-    """Make the recordings of a scene from waveforms of ngspice, with the draws of its `simulate`.
-
-    Raises:
-        NgspiceError: ngspice is not installed or failed.
-        ValueError: ngspice cannot have a load or the pulse of the scene.
-    """
+    """A draw of a scene as its `simulate` makes it, with waveforms of ngspice."""
 
     def voltage(trial: Trial, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
         pulse_rate = float(f[0])
@@ -139,9 +129,6 @@ def harmonics(netlist: str, pulse_rate: float, count: int) -> Complex[np.ndarray
     """Fourier coefficients [V] of the steady state at the first harmonics.
 
     The steps of ngspice are uneven: a cubic spline through them is sampled evenly.
-
-    Raises:
-        NgspiceError: As `solve`; or the last two periods differ, so that this is no steady state.
     """
     time, v = solve(netlist)
     period = 1 / pulse_rate
@@ -159,11 +146,7 @@ def harmonics(netlist: str, pulse_rate: float, count: int) -> Complex[np.ndarray
 
 
 def solve(netlist: str) -> Float[np.ndarray, "row step"]:
-    """Times [s] and what is saved, such as v(o) [V], at the steps of ngspice, or from `CACHE`.
-
-    Raises:
-        NgspiceError: ngspice is not installed or failed.
-    """
+    """Times [s] and what is saved, such as v(o) [V], at the steps of ngspice, or from `CACHE`."""
     name = hashlib.sha256(f"{_version()}\n{netlist}".encode()).hexdigest()[:32]
     kept = CACHE / f"{name}.npy"
     if kept.exists():
@@ -182,11 +165,7 @@ def solve(netlist: str) -> Float[np.ndarray, "row step"]:
 
 
 def waveform(raw: bytes) -> Float[np.ndarray, "row step"]:
-    """Time [s] and the voltages [V] or currents [A] of a binary raw file of ngspice.
-
-    Raises:
-        NgspiceError: It is no such file, or not whole.
-    """
+    """Time [s] and the voltages [V] or currents [A] of a binary raw file of ngspice."""
     head, mark, body = raw.partition(b"Binary:\n")
     fields = dict(
         line.split(":", 1) for line in io.StringIO(head.decode(errors="replace")) if ":" in line

@@ -1,11 +1,10 @@
 """What does noise that is not white, or not equal in both records, cost, and are intervals honest?
 
-Dry and damp skin behind drivers drawn anew, as `benchmarks.perturbed_study.undisturbed` has them;
-all records, those of the calibration too, get noise in addition to the white one: 1/f noise with a
-corner frequency, where both are equal, in both records or in that of V_out alone; white noise of
-three times the size in V_out; and mains hum. For each, the verdicts, the median χ², the part of the
-95 % intervals that contain the truth, and the median standard errors of R_s, R_p and C_p, relative
-to those with white noise. The targets are those of `benchmarks.coverage`.
+All records of `benchmarks.perturbed_study.undisturbed` get noise in addition to the white one: 1/f
+noise with a corner frequency, where both are equal, in both records or in that of V_out alone;
+white noise of three times the size in V_out; mains hum. For each, the verdicts, the median χ², the
+coverage (with the targets of `benchmarks.coverage`), and the median standard errors of R_s, R_p and
+C_p relative to those with white noise.
 """
 
 import argparse
@@ -13,12 +12,10 @@ import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
-from jaxtyping import Float
 
 import etid
 from benchmarks.coverage import identified, targets
-from benchmarks.disturbances import Added, hum
-from benchmarks.laboratory import Record
+from benchmarks.laboratory import Added, Flicker, Record, hum
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import all_records, both, out, undisturbed
 from benchmarks.runner import Target, option, report
@@ -26,23 +23,6 @@ from benchmarks.runner import Target, option, report
 TRUTH = {path: dataclasses.astuple(skin) for path, skin in LOADS.items()}
 FIRST = 2000  # number of the first driver
 HUM = 0.01  # [V at the converter]
-
-
-@dataclasses.dataclass(frozen=True)
-class Flicker:
-    """Noise of the power σ² f_c/f, which equals that of white noise at the corner frequency f_c."""
-
-    sigma: float  # standard deviation of a sample of the white noise [V at the converter]
-    corner: float  # f_c [Hz]
-
-    def __call__(
-        self, time: Float[np.ndarray, " time"], rng: np.random.Generator
-    ) -> Float[np.ndarray, " time"]:
-        """Volts at these times [s]."""
-        white = np.fft.rfft(self.sigma * rng.standard_normal(time.size))
-        white[0] = 0.0
-        white[1:] *= np.sqrt(self.corner / np.fft.rfftfreq(time.size, time[1])[1:])
-        return np.fft.irfft(white, time.size)
 
 
 def white(sigma: float) -> Added:
@@ -79,7 +59,6 @@ def studies(
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print the table; whether the intervals are as right with every noise as `coverage` asks."""
     asked: list[Target] = []
     for snr_db in arguments.snr_db:
         usual = None

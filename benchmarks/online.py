@@ -8,7 +8,6 @@ false alarms and the detection of wet skin (`benchmarks.online_alarms`).
 
 import argparse
 import gc
-import pathlib
 import time
 from collections.abc import Iterator
 
@@ -19,7 +18,7 @@ from tqdm import tqdm
 import etid
 from benchmarks.machine import RESULTS
 from benchmarks.online_alarms import LOADS, SOON, Fingertip, alarms
-from benchmarks.rivals import RivalError, exchange, make
+from benchmarks.rivals import RivalError, exchange
 from benchmarks.runner import Target, at_least, at_most, option, report
 from etid.online.state import TrackerState
 
@@ -34,7 +33,6 @@ TARGETS = {
 }
 CHARGE = 80e-9  # [C] per phase
 RIVAL_TICKS = 30
-ENVIRONMENT, WORKER = "filterpy", "benchmarks.rivals.kalman_by_filterpy"
 OFF = 0.05  # of the elements, by which its start differs from what the tracker has found
 WARM = 50  # ticks before the first that counts: compilation, and the start of every electrode
 KINDS = 60  # different pulses, over and over
@@ -45,22 +43,17 @@ OPTIONS = (
     option("--electrodes", default=98),
     option("--ticks", default=2000),
     option("--hours", default=4.0, help="electrode hours of false alarms; 0 for none"),
-    option("-o", "--output", type=pathlib.Path, default=RESULTS / "online.csv"),
+    option("-o", "--output", default=RESULTS / "online.csv"),
 )
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print the table and write it; whether all targets are met."""
     electrodes, hours = arguments.electrodes, arguments.hours
     found = list(ticks(electrodes, arguments.ticks))
     for snr_db in NOISES if hours > 0 else ():
-        found += tests(electrodes, snr_db, hours)
+        counts = alarms(electrodes, snr_db, hours).items()
+        found += [Target.of(TARGETS, *of, f"{snr_db:g} dB: ") for of in counts]
     return report(found, arguments.output)
-
-
-def named(name: str, value: float, of: str = "") -> Target:
-    """A number, with the limits that `TARGETS` has for its name; `of` says which of several."""
-    return Target(f"{of}{name}", value, *TARGETS.get(name, (np.nan, np.nan)))
 
 
 def ticks(electrodes: int, number: int) -> Iterator[Target]:
@@ -72,7 +65,7 @@ def ticks(electrodes: int, number: int) -> Iterator[Target]:
         # The processor's own time is less where other programs take turns on that core.
         for kind, of in (("wall: ", ratios), ("processor: ", busy)):
             value = float(np.percentile(of, percent))
-            yield named(f"{name} of the tick / pulse period", value, kind)
+            yield Target.of(TARGETS, f"{name} of the tick / pulse period", value, kind)
     logs = np.asarray(state.electrodes.own)[:, :-1]
     some, theirs = pulses[np.arange(RIVAL_TICKS) % len(pulses)], np.nan
     try:
@@ -81,18 +74,7 @@ def ticks(electrodes: int, number: int) -> Iterator[Target]:
         print(f"filterpy: {error}")
     period = tracker.period / tracker.model.bands.sample_rate
     factor = theirs / (period * float(np.median(busy)))
-    yield named("filterpy's extended Kalman filter / tick", factor, "processor: ")
-
-
-def tests(electrodes: int, snr_db: float, hours: float) -> Iterator[Target]:
-    """False alarms and detection at one noise."""
-    found, at = alarms(electrodes, snr_db, hours), f"{snr_db:g} dB: "
-    yield named("electrode hours without a change", found.hours, at)
-    yield named("false alarms in them", found.false, at)
-    yield named("false alarms per electrode and hour, 95 % limit", found.hourly(), at)
-    yield named("false alarms of the driver", found.driver, at)
-    yield named("electrodes that became wet", found.changes, at)
-    yield named(f"wet skin that is found within {SOON} pulses", found.soon(), at)
+    yield Target.of(TARGETS, "filterpy's extended Kalman filter / tick", factor, "processor: ")
 
 
 def timed(
@@ -129,14 +111,11 @@ def seconds_of_filterpy(
     Its filters start near the logarithms that the tracker has found; a `RivalError` if there is no
     filterpy.
     """
-    missing = make(ENVIRONMENT)
-    if missing:
-        raise RivalError(missing)
     seen = [tracker.projection.seen(v_out, tracker.adc_range) for v_out in pulses]
     variance, begins = np.stack([of.variance for of in seen]), np.arange(len(pulses)) % 3
     found = exchange(
-        ENVIRONMENT,
-        WORKER,
+        "filterpy",
+        "kalman_by_filterpy",
         gains=np.stack([np.asarray(one.gain()) for one in seen]),
         variances=variance[:, :, None] / np.asarray(tracker.model.bands.weight),
         delays=begins * tracker.period - np.round(begins * tracker.period),

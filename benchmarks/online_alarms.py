@@ -30,25 +30,6 @@ WET, TIMES = 0.4, 25  # part of the electrodes that become wet at once, and how 
 SOON = 2  # pulses within which the change must be found
 
 
-@dataclasses.dataclass(frozen=True)
-class Alarms:
-    """What the tests for changes have shown."""
-
-    hours: float  # electrode hours without a change
-    false: int  # changes of electrodes found in them
-    driver: int  # changes of the driver found in them
-    changes: int  # electrodes that have become wet
-    found: int  # how many of them were found within `SOON` pulses
-
-    def hourly(self) -> float:
-        """Largest rate of false alarms per electrode and hour that 95 % confidence allows."""
-        return float(scipy.special.gammaincinv(self.false + 1, 0.95)) / self.hours
-
-    def soon(self) -> float:
-        """Part of the electrodes that became wet that was found within `SOON` pulses."""
-        return self.found / self.changes
-
-
 class Fingertip:
     """Pulses of a display at one noise; `change` is the random walk that the tracker expects."""
 
@@ -78,12 +59,11 @@ class Fingertip:
         return clean + self.sigma * self.rng.standard_normal(clean.shape, np.float32)
 
     def pulses(self, loads: np.ndarray, number: int) -> Iterator[Float[np.ndarray, "lane sample"]]:
-        """The first pulses."""
         return (self.pulse(at, loads) for at in range(number))
 
 
-def alarms(electrodes: int, snr_db: float, hours: float) -> Alarms:
-    """Simulate a display for so many electrode hours without a change."""
+def alarms(electrodes: int, snr_db: float, hours: float) -> dict[str, float]:
+    """What the tests for changes show in so many electrode hours, and after a change."""
     display = Fingertip(electrodes, snr_db)
     tracker = display.tracker
     loads = np.arange(electrodes) % len(LOADS)
@@ -112,4 +92,13 @@ def alarms(electrodes: int, snr_db: float, hours: float) -> Alarms:
         found += len(seen & {*wet.tolist()})
     jax.block_until_ready(state)
     counted = (pulses - SETTLING) * electrodes / hourly
-    return Alarms(counted, false, driver, TIMES * wet.size, found)
+    # The largest rate that 95 % confidence allows.
+    most = float(scipy.special.gammaincinv(false + 1, 0.95)) / counted
+    return {
+        "electrode hours without a change": counted,
+        "false alarms in them": false,
+        "false alarms per electrode and hour, 95 % limit": most,
+        "false alarms of the driver": driver,
+        "electrodes that became wet": TIMES * wet.size,
+        f"wet skin that is found within {SOON} pulses": found / (TIMES * wet.size),
+    }

@@ -1,21 +1,16 @@
 """What causes the errors of the paper: its Tables I and IV from simulated measurements.
 
-Five laboratories make the same recordings. `good` has 60 dB and one clock. Each of the next three
-has one thing worse: white noise of 40 or of 30 dB, or trigger delays of 200 ns (rms) in every
-record, the calibration included. `both`, with 40 dB and 200 ns, is where the paper's method errs as
-much as the paper prints. The tables put the two causes apart: noise biases Steiglitz-McBride, the
-same in every trial; delays spread its trials. A study is made several times, each with a
-calibration of its own. `table_4.svg` shows error and scatter of the built circuit by cause.
-
-Rows are tidy: one per laboratory, method and element, beside what the paper prints. Errors, spreads
-and scatters are in per cent. A fit without a circuit (an estimate that is negative or complex)
-enters no statistics; `circuits` of `fits` do.
+Five laboratories make the same recordings: `good` with 60 dB and one clock, three with one thing
+worse (white noise of 40 or of 30 dB, or trigger delays of 200 ns rms in every record), and `both`,
+where the paper's method errs as much as the paper prints. Noise biases Steiglitz-McBride, the same
+in every trial; delays spread its trials. A study is made several times, each with a calibration of
+its own. Rows are one per laboratory, method and element, in per cent, beside what the paper prints.
+A fit without a circuit (an estimate that is negative or complex) enters no statistics.
 """
 
 import argparse
 import dataclasses
 import pathlib
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -39,7 +34,7 @@ LABORATORIES: Mapping[str, Mapping[str, float]] = {
     "delays 200 ns": {"snr_db": 60.0, "trigger_jitter_rms": 200e-9},
     "both": ENDS["noisy"],
 }
-DEFAULT, THEIRS = METHODS
+DEFAULT = METHODS[0]
 Row = dict[str, Any]
 Groups = Mapping[tuple[str, str], Sequence[Outcome]]
 """The studies of each laboratory and method."""
@@ -53,7 +48,7 @@ TARGETS = {
 OPTIONS = (
     QUICK,
     option("--source", default="simulated", choices=SOURCES),
-    option("--folder", default=pathlib.Path("results/paper"), type=pathlib.Path),
+    option("--folder", default=pathlib.Path("results/paper")),
 )
 
 
@@ -135,31 +130,11 @@ def targets(first: Sequence[Row], fourth: Sequence[Row]) -> Iterator[Target]:
     """Whether the default method is as right as it is to be."""
     resistors, mean = TARGETS
     good = [row for row in first if (row["laboratory"], row["method"]) == ("good", DEFAULT)]
-    yield Target(resistors, max(row["rms"] for row in good), *TARGETS[resistors])
+    yield Target.of(TARGETS, resistors, max(row["rms"] for row in good))
     for row in fourth:
         if (row["laboratory"], row["method"]) == (OWN_NOISE, DEFAULT):
             error = abs(row["error"]) / row["stderr"] * row["studies"] ** 0.5
-            yield Target(f"{mean}: {row['element']}", error, *TARGETS[mean])
-
-
-def cause(fourth: Sequence[Row]) -> str:
-    """What Table IV says of the causes, in its own numbers."""
-
-    def r_s(laboratory: str) -> Row:
-        return next(
-            row for row in fourth
-            if (row["laboratory"], row["method"], row["element"]) == (laboratory, THEIRS, "r_s")
-        )  # fmt: skip
-
-    noise, delays, both = map(r_s, ("noise 40 dB", "delays 200 ns", "both"))
-    return (
-        f"R_s of the built circuit by the paper's method: white noise alone shifts all trials by "
-        f"{noise['error']:.1f} % and scatters them by {noise['scatter']:.1f} %; delays alone shift "
-        f"them by {delays['error']:.1f} % and scatter them by {delays['scatter']:.1f} %, and leave "
-        f"{delays['fits'] - delays['circuits']} of {delays['fits']} without a circuit; both give "
-        f"{both['error']:.1f} % and {both['scatter']:.1f} %. The paper prints "
-        f"{both['paper_error']:g} % and {both['paper_scatter']:g} %."
-    )
+            yield Target.of(TARGETS, mean, error, after=f": {row['element']}")
 
 
 def draw(rows: Sequence[Row], path: pathlib.Path) -> None:
@@ -194,7 +169,6 @@ def draw(rows: Sequence[Row], path: pathlib.Path) -> None:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Make, identify, print, write tables and figure; whether the targets are met."""
     folder, source, quick = arguments.folder, arguments.source, arguments.quick
     truth = etid.scenes.paper().truth()
     groups: dict[tuple[str, str], list[Outcome]] = {}
@@ -208,7 +182,6 @@ def main(arguments: argparse.Namespace) -> bool:
         write_csv(folder / f"table_{which}.csv", [{"source": source, **row} for row in rows])
         for row in rows:
             show({"table": which, **row})
-    print(f"\n{textwrap.fill(cause(fourth), 100)}\n")
     draw(fourth, folder / "table_4.svg")
     print(f"Tables and figure: {folder.resolve()}")
     return report(targets(first, fourth))

@@ -16,16 +16,18 @@ import scipy.stats
 
 from benchmarks import perturbed_study as lab
 from benchmarks import visibility
-from benchmarks.disturbances import Leaky, hum, offset, spike
 from benchmarks.failure_axes import Cole, TwoLayers
+from benchmarks.laboratory import hum, leaky, offset, pink, spike
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import Change, all_records, both, calibrations, out, th, trials
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 
+SIX = 20_000  # samples of six periods
+
 UNDISTURBED: Mapping[str, Change] = {
     "base": lambda study: study,
     "base_no_delay": lambda study: all_records(both(delay=0.0))(study),
-    "base_six_periods": lab.longer(),
+    "base_six_periods": lab.lasting(SIX),
     "base_two_resistors": lab.second_resistor(1.0),
     "base_whole_samples_per_period": lab.coherent(),
 }
@@ -55,15 +57,15 @@ NUISANCES: Mapping[str, Change] = {
     "spike_0.1V_5ms_out": trials(out(added=(spike(0.1, 5e-3),))),
     "spike_1V_5ms_out": trials(out(added=(spike(1.0, 5e-3),))),
     "spike_1V_0.1ms_out": trials(out(added=(spike(1.0, 1e-4),))),
-    "spike_1V_5ms_out_six_periods": lab.longer(trials(out(added=(spike(1.0, 5e-3),)))),
-    "spike_0.1V_5ms_th_six_periods": lab.longer(trials(th(added=(spike(0.1, 5e-3),)))),
+    "spike_1V_5ms_out_six_periods": lab.lasting(SIX, trials(out(added=(spike(1.0, 5e-3),)))),
+    "spike_0.1V_5ms_th_six_periods": lab.lasting(SIX, trials(th(added=(spike(0.1, 5e-3),)))),
     "jump_0.5V_5ms_out": trials(out(added=(spike(0.5, 5e-3, rectangular=True),))),
     "jump_1V_5ms_out": trials(out(added=(spike(1.0, 5e-3, rectangular=True),))),
     "tail_5mV_5ms": all_records(lab.tail(5e-3, 5e-3)),
     "tail_5mV_5ms_skin": trials(lab.tail(5e-3, 5e-3)),
     "crosstalk_1%_neighbour": trials(lab.crosstalk(4e-3)),
     "crosstalk_1%_unloaded": trials(lab.crosstalk(0.0)),
-    "coloured_noise_1/f": all_records(lab.pink),
+    "coloured_noise_1/f": all_records(lambda of: both(added=(pink(3 * of.sigma),))(of)),
 }
 
 CONVERTERS: Mapping[str, Change] = {
@@ -82,7 +84,7 @@ CONVERTERS: Mapping[str, Change] = {
     "three_digits": all_records(lab.record(digits=3, told={"adc_range": None})),
     "out_a_tenth_skin_only": trials(out(gain=0.1)),
     "lowpass_80kHz_skin": trials(out(lowpass=80e3)),
-    "lowpass_80kHz_skin_one_period": lab.single(trials(out(lowpass=80e3))),
+    "lowpass_80kHz_skin_one_period": lab.lasting(3_400, trials(out(lowpass=80e3))),
     "capacitance_5pF_skin": trials(lab.shunted(5e-12)),
     "adc_jitter_500ns": all_records(both(sampling_jitter=500e-9)),
     "slow_adc_filter_out": all_records(out(lowpass=30e3)),
@@ -99,19 +101,20 @@ CONVERTERS: Mapping[str, Change] = {
     "swapped_skin_only": trials(lab.record(swapped=True)),
 }
 
-_MISSING, _DOUBLE = ((0, 1.0), (2, 1.0)), ((0, 1.0), (1, 1.0), (1.5, 1.0), (2, 1.0))
+_MISSING = {"pulses": ((0, 1.0), (2, 1.0)), "over": 3}
+_DOUBLE = {"pulses": ((0, 1.0), (1, 1.0), (1.5, 1.0), (2, 1.0)), "over": 3}
 CLOCKS: Mapping[str, Change] = {
-    "missing_pulse_out": trials(out(**lab.pulses(*_MISSING))),
-    "missing_pulse_both": trials(both(**lab.pulses(*_MISSING))),
-    "double_pulse_out": trials(out(**lab.pulses(*_DOUBLE))),
-    "double_pulse_both": trials(both(**lab.pulses(*_DOUBLE))),
+    "missing_pulse_out": trials(out(**_MISSING)),
+    "missing_pulse_both": trials(both(**_MISSING)),
+    "double_pulse_out": trials(out(**_DOUBLE)),
+    "double_pulse_both": trials(both(**_DOUBLE)),
     **{
         f"{fault}_sample_{name}": trials(change(**{fault: 5000}))
         for fault in ("lost", "doubled")
         for name, change in (("out", out), ("th", th))
     },
     "lost_sample_in_pulse_out": trials(out(lost=3420)),
-    "lost_sample_out_six_periods": lab.longer(trials(out(lost=12_000))),
+    "lost_sample_out_six_periods": lab.lasting(SIX, trials(out(lost=12_000))),
     "edge_at_the_joint_pulses_jitter": trials(lab.on_edge),
     "clock_out_20ppm": all_records(out(pulse_rate=60.0012)),
     "clock_out_20ppm_skin": trials(out(pulse_rate=60.0012)),
@@ -131,7 +134,9 @@ CLOCKS: Mapping[str, Change] = {
         f"says_{rate // 1000}kHz": all_records(lab.record(told={"sample_rate": float(rate)}))
         for rate in (50_000, 100_000, 250_000, 400_000)
     },
-    "says_100kHz_six_periods": lab.longer(all_records(lab.record(told={"sample_rate": 100e3}))),
+    "says_100kHz_six_periods": lab.lasting(
+        SIX, all_records(lab.record(told={"sample_rate": 100e3}))
+    ),
     **{
         f"says_{rate}Hz": all_records(lab.record(told={"pulse_rate": float(rate)}))
         for rate in (20, 30, 50, 90, 120, 180)
@@ -147,13 +152,13 @@ SKINS: Mapping[str, Change] = {
         for kind in ("linear", "step")
     },
     "cp_linear_0.05": lab.changing("c_p", 0.05, False),
-    "rp_linear_0.05_six_periods": lab.longer(lab.changing("r_p", 0.05, False, 6)),
-    "rs_step_0.2_six_periods": lab.longer(lab.changing("r_s", 0.2, True, 6)),
+    "rp_linear_0.05_six_periods": lab.lasting(SIX, lab.changing("r_p", 0.05, False, 6)),
+    "rs_step_0.2_six_periods": lab.lasting(SIX, lab.changing("r_s", 0.2, True, 6)),
     "Rp_nonlinear_0.2": lab.nonlinear(0.2),
     "Rp_nonlinear_0.4": lab.nonlinear(0.4),
     "cole_alpha0.8": lab.skin_is(functools.partial(Cole, alpha=0.8), words=True),
     "two_rc_mid": lab.skin_is(functools.partial(TwoLayers, share=0.3), words=True),
-    "leak_100Rp": lab.skin_is(lambda skin: Leaky(skin, 100 * skin.r_p)),
+    "leak_100Rp": lab.skin_is(lambda skin: leaky(skin, 100 * skin.r_p)),
 }
 
 _ALL_PARTS = ("r_protection", "r_secondary", "l_secondary", "l_magnetising", "r_source")
@@ -168,8 +173,8 @@ DRIVERS: Mapping[str, Change] = {
     "driver_Csec_x1.1": trials(lab.parts(c_secondary=1.1)),
     "driver_Ccab_x1.1": trials(lab.parts(c_cable=1.1)),
     "driver_all_5%": trials(lab.parts(**dict.fromkeys(_ALL_PARTS, 1.05))),
-    "driver_Vp_+2%_out_vs_th": trials(lab.louder(1.02)),
-    "driver_Vp_-2%_out_vs_th": trials(lab.louder(0.98)),
+    "driver_Vp_+2%_out_vs_th": trials(lab.parts("out", amplitude=1.02)),
+    "driver_Vp_-2%_out_vs_th": trials(lab.parts("out", amplitude=0.98)),
 }
 
 CALIBRATIONS: Mapping[str, Change] = {

@@ -7,10 +7,6 @@ It is *refused* if it is right and not called successful, *said* if it is wrong,
 called successful, and *silent* if it is wrong and called successful. An element that changes during
 a record is wrong if one of its values is farther away than that; if the fit remarks on something
 in the recording, any of them will do. A method without standard errors is held to the bound.
-
-The targets: no silent answer but for the perturbations of `INVISIBLE`, of which no more are silent
-than the best possible test would miss (`benchmarks.visibility`), and at most 2 % of the undisturbed
-recordings refused.
 """
 
 import argparse
@@ -21,7 +17,6 @@ import pathlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 import etid
@@ -29,7 +24,6 @@ from benchmarks import charts, estimators
 from benchmarks.estimators import DEFAULT, ELEMENTS, FAR, Answer, Drivers, fits, found_by
 from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS, recorded
-from benchmarks.machine import make_room
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
 from benchmarks.perturbed_study import Truth, undisturbed
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, show, tabled
@@ -95,33 +89,28 @@ def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[s
 
 def answers_of(names: Sequence[str], number: int, snr_db: float) -> list[Answer]:
     """All answers behind one driver with one noise; perturbations that share a driver together."""
-    with jax.enable_x64(True):  # of a worker process
-        drivers, found = Drivers(), list[Answer]()
-        together: dict[int, list[tuple[str, Record, Truth]]] = {}
-        behind: dict[int, etid.Driver | None] = {}
-        for name in names:
-            study = PERTURBATIONS[name](undisturbed(number, snr_db))
-            driver = drivers.of([of.recording(number) for of in study.calibrations], DEFAULT)
-            behind[id(driver)] = driver
-            trials = [(name, of, study.truths[of.path]) for of in study.trials]
-            together.setdefault(id(driver), []).extend(trials)
-        for key, trials in together.items():
-            every = fits([of.recording(number) for _, of, _ in trials], behind[key], DEFAULT)
-            for (name, of, truth), fit in zip(trials, every, strict=True):
-                values, stderr, verdict = found_by(fit)
-                found.append(
-                    Answer(
-                        *(DEFAULT, number, of.path, verdict),
-                        error=error_of(values, truth, fit is not None and int(fit.remarks) != 0),
-                        stderr=stderr / ((truth.low + truth.high) / 2),
-                        bound=_bounds(snr_db, of.samples, of.bits, of.full_scale)[of.path],
-                        exact=not truth.words,
-                        perturbation=name,
-                        snr_db=snr_db,
-                    )
-                )
-        make_room()
-        return found
+    drivers, found = Drivers(), list[Answer]()
+    together: dict[int, tuple[etid.Driver | None, list[tuple[str, Record, Truth]]]] = {}
+    for name in names:
+        study = PERTURBATIONS[name](undisturbed(number, snr_db))
+        driver = drivers.of([of.recording(number) for of in study.calibrations], DEFAULT)
+        _, trials = together.setdefault(id(driver), (driver, []))
+        trials += [(name, of, study.truths[of.path]) for of in study.trials]
+    for driver, trials in together.values():
+        every = fits([of.recording(number) for _, of, _ in trials], driver, DEFAULT)
+        for (name, of, truth), fit in zip(trials, every, strict=True):
+            values, stderr, verdict = found_by(fit)
+            one = Answer(
+                *(DEFAULT, number, of.path, verdict),
+                error=error_of(values, truth, fit is not None and int(fit.remarks) != 0),
+                stderr=stderr / ((truth.low + truth.high) / 2),
+                bound=_bounds(snr_db, of.samples, of.bits, of.full_scale)[of.path],
+                exact=not truth.words,
+                perturbation=name,
+                snr_db=snr_db,
+            )
+            found.append(one)
+    return found
 
 
 def table(answers: Sequence[Answer], by: Sequence[str]) -> list[dict[str, Any]]:
@@ -160,12 +149,12 @@ def targets(answers: Sequence[Answer]) -> Iterator[Target]:
         name, place, count = row["perturbation"], (row["path"], row["snr_db"]), row[silent]
         known = INVISIBLE.get(name)
         if count and not (known and known.excuses(*place, count, row["answers"])):
-            where = f"{silent}: {name}, {place[0]} at {place[1]:g} dB"
-            yield Target(where, count, *TARGETS[silent], f"{count} of {row['answers']}")
+            where, text = f": {name}, {place[0]} at {place[1]:g} dB", f"{count} of {row['answers']}"
+            yield Target.of(TARGETS, silent, count, after=where, text=text)
     for row in table(answers, ("perturbation",)):
         if row["perturbation"] in UNDISTURBED:
             share = (row["refused"] + row["said"]) / row["answers"]
-            yield Target(f"{refused}: {row['perturbation']}", share, *TARGETS[refused])
+            yield Target.of(TARGETS, refused, share, after=f": {row['perturbation']}")
 
 
 def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
@@ -186,7 +175,6 @@ def _label(name: str) -> str:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Draw, count and print; write the table with every driver that is done, and the picture."""
     quick, folder = arguments.quick, arguments.folder
     names = list(FEW) if quick else arguments.only or list(PERTURBATIONS)
     numbers = range(2 if quick else arguments.drivers)

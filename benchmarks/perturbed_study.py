@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks import disturbances
-from benchmarks.disturbances import Nonlinear
-from benchmarks.laboratory import CORNER, SCALE, Output, Record, noise
+from benchmarks.laboratory import CORNER, SCALE, Nonlinear, Output, Record, exponential, noise
 from benchmarks.ladder import LOADS
 from etid.simulation.published import REFERENCE
 from etid.simulation.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
@@ -112,11 +110,8 @@ def _fields(*names: str) -> Callable[..., Callable[[Record], Record]]:
     return changing
 
 
-all_records, calibrations, trials = (
-    _to("calibrations", "trials"),
-    _to("calibrations"),
-    _to("trials"),
-)
+all_records, calibrations = _to("calibrations", "trials"), _to("calibrations")
+trials = _to("trials")
 both, out, th = _fields("th", "out"), _fields("out"), _fields("th")
 
 
@@ -130,20 +125,15 @@ def late(samples: float) -> Callable[[Record], Record]:
     return lambda of: out(delay=of.out.delay + samples * SAMPLE)(of)
 
 
-def scaled(driver: TransformerDriver, **factors: float) -> TransformerDriver:
-    """A driver with some parts multiplied."""
-    new = {name: getattr(driver, name) * factor for name, factor in factors.items()}
-    return dataclasses.replace(driver, **new)
+def parts(*voltages: str, **factors: float) -> Callable[[Record], Record]:
+    """Multiply parts of the driver behind some voltages, or behind both."""
 
+    def change(of: Record) -> Record:
+        driver = of.out.driver
+        new = {name: getattr(driver, name) * factor for name, factor in factors.items()}
+        return _fields(*(voltages or ("th", "out")))(driver=dataclasses.replace(driver, **new))(of)
 
-def parts(**factors: float) -> Callable[[Record], Record]:
-    """Multiply parts of the driver behind both voltages."""
-    return lambda of: both(driver=scaled(of.out.driver, **factors))(of)
-
-
-def louder(factor: float) -> Callable[[Record], Record]:
-    """Multiply the amplitude of the driver behind the loaded voltage."""
-    return lambda of: out(driver=scaled(of.out.driver, amplitude=factor))(of)
+    return change
 
 
 def crosstalk(later: float) -> Callable[[Record], Record]:
@@ -201,11 +191,6 @@ def nonlinear(fall: float) -> Change:
     return _other(lambda of: out(voltage=Nonlinear(LOADS[of.path], fall))(of), truth)
 
 
-def pulses(*places: tuple[float, float]) -> dict[str, Any]:
-    """Fields of a voltage with these pulses in a record of three periods."""
-    return {"pulses": places, "over": PERIODS}
-
-
 def _later(of: Record, by: float, **fields: Any) -> Record:
     """The record with both voltages later by so much [s], and with other fields."""
     for name in ("th", "out"):
@@ -217,8 +202,8 @@ def _later(of: Record, by: float, **fields: Any) -> Record:
 def on_edge(of: Record) -> Record:
     """Begin both records on an edge, and let the last pulse of three come one sample late."""
     driver, late = of.th.driver, PULSE_RATE * SAMPLE
-    places = (0, 1.0), (1, 1.0), (2 + late, 1.0)
-    return _later(of, driver.lead_in + driver.edge / 2, **pulses(*places))
+    pulses = (0, 1.0), (1, 1.0), (2 + late, 1.0)
+    return _later(of, driver.lead_in + driver.edge / 2, pulses=pulses, over=PERIODS)
 
 
 def second_resistor(factor: float) -> Change:
@@ -236,9 +221,9 @@ def second_resistor(factor: float) -> Change:
     return change
 
 
-def longer(change: Change = lambda study: study) -> Change:
-    """Record six periods."""
-    return lambda study: change(all_records(record(samples=20_000))(study))
+def lasting(samples: int, change: Change = lambda study: study) -> Change:
+    """Make records of another length."""
+    return lambda study: change(all_records(record(samples=samples))(study))
 
 
 def coherent(antialias: float = CORNER) -> Change:
@@ -253,18 +238,13 @@ def coherent(antialias: float = CORNER) -> Change:
     return change
 
 
-def pink(of: Record) -> Record:
-    """Both voltages with 1/f noise of three times the effective value of the white noise."""
-    return both(added=(disturbances.pink(3 * of.sigma),))(of)
-
-
 def tail(height: float, time_constant: float) -> Callable[[Record], Record]:
     """Let every loaded pulse leave a tail [V at the terminal, s]."""
 
     def change(of: Record) -> Record:
         driver = of.out.driver
         times = time_constant, driver.lead_in + driver.width, 1 / PULSE_RATE
-        return out(added=(disturbances.tail(SCALE * height, *times),))(of)
+        return out(added=(exponential(SCALE * height, *times),))(of)
 
     return change
 
@@ -276,8 +256,3 @@ def shunted(c: float) -> Callable[[Record], Record]:
         return lambda f: load(f) / (1 + 2j * np.pi * f * c * load(f))
 
     return lambda of: out(loads=tuple(map(across, of.out.loads)))(of)
-
-
-def single(change: Change) -> Change:
-    """Record one period and a little more."""
-    return lambda study: change(all_records(record(samples=3_400))(study))

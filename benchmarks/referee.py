@@ -11,11 +11,10 @@ import argparse
 import numpy as np
 
 from benchmarks.estimators import ELEMENTS
-from benchmarks.rivals import exchange, make
+from benchmarks.rivals import exchange
 from benchmarks.runner import Target, at_most, option, report
 
 ENVIRONMENT = "numpyro"
-WORKER = "benchmarks.rivals.posterior_by_numpyro"
 ENDED = 400.0  # effective draws of a chain that stayed at the fit; others have a few dozens
 # Of the median fit. 400 draws know a mean to 0.05 standard deviations, a deviation to 3.5 %.
 TARGETS = {
@@ -30,11 +29,6 @@ OPTIONS = (
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Install numpyro, run both, print; whether they agree."""
-    missing = make(ENVIRONMENT)
-    if missing:
-        print(missing)
-        return False
     asked: list[Target] = []
     print("SNR dB  fits  no end      ms  effective  NUTS s")
     for snr_db in arguments.snr:
@@ -47,15 +41,14 @@ def main(arguments: argparse.Namespace) -> bool:
             f"{nuts:>8.1f}"
         )
         farthest = np.take_along_axis(ratio, np.abs(ratio - 1).argmax(0)[None], 0)[0]
-        for (name, limits), of, worst in zip(
-            TARGETS.items(), (shift, ratio), (shift.max(0), farthest), strict=True
-        ):
+        for name, of, worst in zip(TARGETS, (shift, ratio), (shift.max(0), farthest), strict=True):
             for element, middle, far in zip(ELEMENTS, np.median(of, axis=0), worst, strict=True):
                 text = f"{middle:.3f} (worst {far:.2f})"
-                asked.append(Target(f"{snr_db:g} dB, {element}: {name}", middle, *limits, text))
+                place = f"{snr_db:g} dB, {element}: "
+                asked.append(Target.of(TARGETS, name, middle, place, text=text))
     return report(asked)
 
 
 def compared(snr_db: float, fits: int) -> dict[str, np.ndarray]:
     """What the worker found at one signal-to-noise ratio."""
-    return exchange(ENVIRONMENT, WORKER, snr_db=snr_db, fits=fits)
+    return exchange(ENVIRONMENT, "posterior_by_numpyro", snr_db=snr_db, fits=fits)

@@ -14,10 +14,11 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.machine import RESULTS, ROOT, provenance, write_csv
+from benchmarks.machine import RESULTS, ROOT, make_room, provenance, write_csv
 from benchmarks.rates import Rate
 from etid.identify import file as streaming
 from etid.recordings.replacing import replacing
@@ -41,7 +42,7 @@ def option(*names: str, default: Any = None, **settings: Any) -> Option:
 
 QUICK = option("--quick", default=False, help="few cases and draws, in a minute or two")
 WORKERS = option("--workers", default=2, help="processes, each on a core of its own")
-FOLDER = option("--folder", default=RESULTS, type=pathlib.Path, help="of tables and pictures")
+FOLDER = option("--folder", default=RESULTS, help="of tables and pictures")
 
 
 def each(
@@ -50,11 +51,13 @@ def each(
     workers: int = 1,
     unit: str = "task",
     keep: str = "",
+    first: Callable[..., Any] | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Results of a call with the numbers of their tasks, as they are done.
 
     `keep` names a folder in which they are kept for other runs of this commit with these versions;
-    nothing is kept while the working tree is not that of a commit.
+    nothing is kept while the working tree is not that of a commit. Tasks with the smallest `first`
+    are begun first.
     """
     folder = _kept(keep) if keep else None
 
@@ -69,6 +72,8 @@ def each(
             yield number, pickle.loads(place(number).read_bytes())
             bar.update()
         left = [number for number in range(len(tasks)) if number not in done]
+        if first is not None:
+            left.sort(key=lambda number: first(*tasks[number]))
         for number, found in _called(call, {number: tasks[number] for number in left}, workers):
             if folder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
@@ -89,14 +94,22 @@ def _kept(name: str) -> pathlib.Path | None:
     return place
 
 
+def _done(call: Callable[..., Any], *task: Any) -> Any:
+    """A task in float64, in a worker process as well, and room for what the next one compiles."""
+    with jax.enable_x64(True):
+        found = call(*task)
+    make_room()
+    return found
+
+
 def _called(
     call: Callable[..., Any], tasks: Mapping[int, tuple], workers: int
 ) -> Iterator[tuple[int, Any]]:
     if workers == 1 or len(tasks) < 2:
-        yield from ((number, call(*task)) for number, task in tasks.items())
+        yield from ((number, _done(call, *task)) for number, task in tasks.items())
         return
     with streaming.processes(workers) as executor:
-        futures = {executor.submit(call, *task): number for number, task in tasks.items()}
+        futures = {executor.submit(_done, call, *task): number for number, task in tasks.items()}
         for future in concurrent.futures.as_completed(futures):
             yield futures[future], future.result()
 
@@ -150,9 +163,24 @@ class Target(NamedTuple):
     interval: tuple[float, float] | None = None  # its scatter, if known; it excuses nothing
 
     @classmethod
-    def of(cls, name: str, value: Rate, limits: Limits = (np.nan, np.nan)) -> "Target":
-        """A rate, with its interval."""
-        return cls(name, value.rate, *limits, str(value), (value.low, value.high))
+    def of(
+        cls,
+        limits: Mapping[str, Limits],
+        name: str,
+        value: float | Rate,
+        before: str = "",
+        after: str = "",
+        text: str = "",
+        interval: tuple[float, float] | None = None,
+    ) -> "Target":
+        """A number or a rate with the limits that its name has, if any.
+
+        What stands `before` or `after` the name says which of several numbers it is.
+        """
+        if isinstance(value, Rate):
+            text, interval, value = str(value), (value.low, value.high), value.rate
+        of = limits.get(name, (np.nan, np.nan))
+        return cls(f"{before}{name}{after}", value, *of, text, interval)
 
     @property
     def met(self) -> bool:

@@ -29,7 +29,6 @@ import etid
 from benchmarks.large_file import LAYOUTS, large_file
 from benchmarks.machine import ROOT, cores, timed, write_csv
 from benchmarks.runner import QUICK, Target, at_least, at_most, option, report, show
-from etid.estimators.registry import names
 from etid.identify import file as streaming
 
 FILES = pathlib.Path(tempfile.gettempdir()) / "etid-scale"
@@ -46,12 +45,11 @@ WORKERS = (1, 2)  # 1 is the process itself
 WARM = 8  # recordings that make every process compile
 PATIENCE = 0.002  # [s] between two looks at a run that is to be killed
 
-METHODS = ["default", "equation_error"]
+METHODS = (None, "equation_error")  # None is the default one
 OPTIONS = (
     QUICK,
     option("--recordings", default=100_000),
-    option("--folder", default=FILES, type=pathlib.Path, help="of the files it makes"),
-    option("--method", nargs="+", type=str, choices=("default", *names()), default=METHODS),
+    option("--folder", default=FILES, help="of the files it makes"),
     option("-o", "--output", type=pathlib.Path, help="CSV to write"),
 )
 
@@ -138,7 +136,7 @@ class Plan(NamedTuple):
     folder: pathlib.Path  # where the files are or will be
     recordings: int  # how many in a file
     part: int  # how many are written at once
-    methods: Sequence[str | None]  # None is the default one; the last is killed, in all layouts run
+    methods: Sequence[str | None]  # the last is killed, and run in all layouts
 
 
 def _start(folder: pathlib.Path, job: dict[str, Any]) -> subprocess.Popen[bytes]:
@@ -152,7 +150,6 @@ def _start(folder: pathlib.Path, job: dict[str, Any]) -> subprocess.Popen[bytes]
 
 
 def measured(folder: pathlib.Path, job: dict[str, Any]) -> dict[str, Any]:
-    """Do one job in a process of its own."""
     with cores(job.get("workers", 1)), _start(folder, job) as process:
         said, _ = process.communicate()
     if process.returncode:
@@ -161,7 +158,6 @@ def measured(folder: pathlib.Path, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def fit_job(plan: Plan, layout: str, method: str | None, workers: int) -> dict[str, Any]:
-    """A job that fits a file."""
     return {
         "what": "fit",
         "file": str(large_file(plan.folder, plan.recordings, layout).absolute()),
@@ -206,23 +202,11 @@ def rows(plan: Plan) -> Iterator[dict[str, Any]]:
                 yield _row(plan, f"fit: {method or 'default'}", layout, workers, found)
 
 
-class Resumed(NamedTuple):
-    """What became of a run that was killed."""
+def resume(plan: Plan) -> bool:
+    """Kill a run at seeded moments, resume it, and compare with a run that was left alone.
 
-    same: bool  # whether its file is bit for bit that of a run that was not
-    parts: int  # how many parts the file has
-    killed_at: list[int]  # how many parts were there at each kill
-    begun: int  # how many parts were begun in all
-    only_the_last: bool  # whether none was begun anew but those that a kill interrupted
-
-    @property
-    def passed(self) -> bool:
-        """Whether nothing was lost and nothing done twice."""
-        return self.same and self.only_the_last and self.begun <= self.parts + len(self.killed_at)
-
-
-def resume(plan: Plan) -> Resumed:
-    """Kill a run at seeded moments, resume it, and compare with a run that was left alone."""
+    Whether the file is the same, and no part was done again but those that a kill interrupted.
+    """
     job = fit_job(plan, "contiguous", plan.methods[-1], 1) | {"warm": ""}
     whole, target = (plan.folder.absolute() / f"{name}.h5" for name in ("whole", "resumed"))
     log = target.with_suffix(".log")
@@ -246,11 +230,16 @@ def resume(plan: Plan) -> Resumed:
         interrupted.append(log.read_text().splitlines()[-1])
     measured(plan.folder, again)
     begun = collections.Counter(log.read_text().splitlines())
-    allowed = collections.Counter(begun.keys()) + collections.Counter(interrupted)
-    found = Resumed(_same(whole, target), parts, killed_at, begun.total(), begun <= allowed)
+    once = begun <= collections.Counter(begun.keys()) + collections.Counter(interrupted)
+    same = _same(whole, target)
     for path in (whole, target, log):
         path.unlink()
-    return found
+    print(
+        f"resume: killed with {', '.join(map(str, killed_at))} of {parts} parts done; "
+        f"{begun.total()} begun in all, {'no' if once else 'SOME'} finished part a second time; "
+        f"the file is {'the same' if same else 'ANOTHER'}, bit for bit"
+    )
+    return same and once and begun.total() <= parts + KILLS
 
 
 def _same(one: pathlib.Path, other: pathlib.Path) -> bool:
@@ -265,7 +254,7 @@ def _same(one: pathlib.Path, other: pathlib.Path) -> bool:
         )
 
 
-def targets(table: Sequence[dict[str, Any]], resumed: Resumed) -> Iterator[Target]:
+def targets(table: Sequence[dict[str, Any]], resumed: bool) -> Iterator[Target]:
     """What is wanted of the last method in contiguous datasets, and of a killed run."""
     fits = [row for row in table if row["what"].startswith("fit")]
     alone, two = [row for row in fits if row["layout"] == "contiguous"][-len(WORKERS) :]
@@ -273,19 +262,15 @@ def targets(table: Sequence[dict[str, Any]], resumed: Resumed) -> Iterator[Targe
         alone["us_per_recording"],
         alone["seconds"] / two["seconds"],
         max(row["memory_mb"] for row in fits),
-        float(not resumed.passed),
+        float(not resumed),
     )
-    for (name, limits), value in zip(TARGETS.items(), values, strict=True):
-        yield Target(name, value, *limits)
+    yield from (Target.of(TARGETS, *of) for of in zip(TARGETS, values, strict=True))
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print the table, write it as CSV; whether every target is met."""
-    names, recordings, part = arguments.method, arguments.recordings, streaming.PART
+    plan = Plan(arguments.folder, arguments.recordings, streaming.PART, METHODS)
     if arguments.quick:
-        names, recordings, part = METHODS[1:], min(recordings, 400), 32
-    methods = [None if name == "default" else name for name in names]
-    plan = Plan(arguments.folder, recordings, part, methods)
+        plan = Plan(arguments.folder, min(arguments.recordings, 400), 32, METHODS[1:])
     table: list[dict[str, Any]] = []
     for row in rows(plan):
         table.append(row)
@@ -294,12 +279,6 @@ def main(arguments: argparse.Namespace) -> bool:
         show(row)
     (plan.folder / "fits.h5").unlink(missing_ok=True)
     resumed = resume(plan)
-    print(
-        f"resume: killed with {', '.join(map(str, resumed.killed_at))} of {resumed.parts} parts "
-        f"done; {resumed.begun} begun in all, "
-        f"{'no' if resumed.only_the_last else 'SOME'} finished part a second time; "
-        f"the file is {'the same' if resumed.same else 'ANOTHER'}, bit for bit"
-    )
     if arguments.output is not None:
         write_csv(arguments.output, table)
     return report(targets(table, resumed))

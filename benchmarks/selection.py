@@ -25,7 +25,8 @@ from benchmarks.failure_axes import Cell
 from benchmarks.failure_draws import AUTO, Effort, answers
 from benchmarks.machine import median_time, timed, write_csv
 from benchmarks.perturbed_study import DELAY
-from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
+from benchmarks.rates import COVERED, clopper_pearson, rate
+from benchmarks.rivals import RivalError
 from benchmarks.runner import Target, at_least, at_most, each, option, report, tabled
 from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
 from etid.selection.search import USUAL
@@ -62,24 +63,21 @@ FACES = {
 }
 
 
-def _rate(name: str, of: Rate, at: str = "") -> Target:
-    return Target.of(f"{name}{at}", of, TARGETS[name])
-
-
 def chosen(rows: Sequence[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[Target]:
     """Right and spurious circuits, and coverage."""
     decisive = {(row["truth"], row["snr_db"]) for row in rows if row["decisive"]}
     asked = [one for one in drawn if (one.truth, one.snr_db) in decisive]
     right = rate([one.is_right for one in asked], [one.driver for one in asked])
     richer = rate([one.is_richer for one in drawn], [one.driver for one in drawn])
-    yield _rate("right circuit where decisive, from 30 dB", right)
-    yield _rate("spurious element, from 20 dB", richer)
+    yield Target.of(TARGETS, "right circuit where decisive, from 30 dB", right)
+    yield Target.of(TARGETS, "spurious element, from 20 dB", richer)
     groups = {"all SNRs: all": (drawn, counts.QUANTITIES)}
     groups |= {f"all SNRs: {name}": (drawn, (name,)) for name in counts.QUANTITIES}
     for snr in sorted({one.snr_db for one in drawn}):
         groups[f"{snr:g} dB: all"] = [one for one in drawn if one.snr_db == snr], counts.QUANTITIES
     for name, (of, quantities) in groups.items():
-        yield _rate("coverage", rate(*counts.covered(of, *quantities)), f", {name}")
+        covered = rate(*counts.covered(of, *quantities))
+        yield Target.of(TARGETS, "coverage", covered, after=f", {name}")
 
 
 def criteria(rows: Sequence[dict[str, Any]]) -> Iterator[Target]:
@@ -98,8 +96,8 @@ def failures(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> Iterat
     silent, elements = counts.missed_elements(asked)
     low, high = clopper_pearson(silent, elements)
     text = f"{silent} of {elements} elements ({100 * low:.3f} to {100 * high:.3f} %)"
-    name = "silent over the failure map"
-    yield Target(name, silent / max(elements, 1), *TARGETS[name], text, (low, high))
+    name, share = "silent over the failure map", silent / max(elements, 1)
+    yield Target.of(TARGETS, name, share, text=text, interval=(low, high))
     drivers = len({one.seed for one in asked})
     print(f"determined elements: {elements} in {len(asked)} answers behind {drivers} drivers")
     for cell, answered in zip(every, found, strict=True):
@@ -108,7 +106,7 @@ def failures(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> Iterat
                 print(f"silent: {', '.join(cell.place.values())}: {one.path}, {one.seed}")
     right = counts.right_from_40_db(every, found)
     if right.trials:
-        yield _rate("right, not one RC, from 40 dB", right)
+        yield Target.of(TARGETS, "right, not one RC, from 40 dB", right)
 
 
 def time_ratios(pairs: int) -> Iterator[Target]:
@@ -141,7 +139,7 @@ def time_ratios(pairs: int) -> Iterator[Target]:
         low, middle, high = np.quantile(of, (0.25, 0.5, 0.75))
         text = f"{middle:.2f} (quartiles {low:.2f} to {high:.2f}) of {len(of)} pairs"
         ratio = "time, auto / plain fit, one RC"
-        yield Target(f"{ratio}, {name}", float(middle), *TARGETS[ratio], text)
+        yield Target.of(TARGETS, ratio, float(middle), after=f", {name}", text=text)
 
 
 def rival(rows: list[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[Target]:
@@ -196,7 +194,6 @@ def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Run the command."""
     quick, workers, folder = arguments.quick, arguments.workers, arguments.folder
     numbers = range(FIRST, FIRST + (FEW_DRIVERS if quick else arguments.drivers))
     tasks = [(float(snr), n) for snr in (FEW_SNR if quick else SNR_DB) for n in numbers]
@@ -209,12 +206,11 @@ def main(arguments: argparse.Namespace) -> bool:
     refused = len(tasks) - len(drawn) // len(TRUTHS)
     print(f"drivers that were not identified: {refused} of {len(tasks)}")
     targets = [*criteria(rows), *chosen(rows, drawn)]
-    missing = selection_rival.missing()
-    if missing:
-        print(f"impedance.py: {missing}")
-    else:
-        few = numbers[:RIVAL_DRIVERS]
+    few = numbers[:RIVAL_DRIVERS]
+    try:
         targets += rival(rows, [d for d in drawn if d.driver in few and d.snr_db in RIVAL_SNR])
+    except RivalError as error:
+        print(f"impedance.py: {error}")
     write_csv(folder / "selection.csv", rows)
     draw(rows, folder / "selection.svg")
     print(f"etid: {1e3 * select_time(FIRST):.0f} ms for a choice (median)")

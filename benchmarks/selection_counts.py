@@ -36,15 +36,12 @@ RIGHT_SNR = ("40 dB", "60 dB", "80 dB")
 Criterion = Callable[[Mapping[int, Fit]], dict[int, float]]
 
 
-def _noise(fits: Mapping[int, Fit]) -> float:
-    """Variance of the residuals of the best candidate, 1 at least, as `bic` has it."""
-    supports = [fit.support for fit in fits.values() if fit.support is not None]
-    return max(1.0, np.nanmin([float(one.deviance) / float(one.terms) for one in supports]))
-
-
 def _penalised(penalty: Callable[[Fit, int], float]) -> Criterion:
     def criterion(fits: Mapping[int, Fit]) -> dict[int, float]:
-        noise, found = _noise(fits), {}
+        supports = [fit.support for fit in fits.values() if fit.support is not None]
+        # Variance of the residuals of the best candidate, 1 at least, as `bic` has it.
+        noise = max(1.0, np.nanmin([float(of.deviance) / float(of.terms) for of in supports]))
+        found = {}
         for number, fit in fits.items():
             assert fit.support is not None
             value = float(fit.support.deviance) / noise + penalty(fit, number)
@@ -86,11 +83,6 @@ CRITERIA: Mapping[str, Criterion] = {
 }
 
 
-def choose(fits: Mapping[int, Fit], criterion: Criterion) -> int:
-    """Number of the candidate that `etid.selection.evidence.best` chooses, by another criterion."""
-    return best(fits, criterion(fits))
-
-
 def gained(drawn: Drawn) -> float:
     """2 log evidence of the true circuit minus the largest one of a simpler circuit."""
     truth, evidence = TRUTHS[drawn.truth], bic(drawn.fits)
@@ -111,7 +103,7 @@ def cell(drawn: Sequence[Drawn]) -> dict[str, Any]:
     row["richer"] = sum(one.is_richer for one in drawn)
     row["fits"] = float(np.mean([len(one.selection.fits) for one in drawn]))
     for name, criterion in CRITERIA.items():
-        found = [USUAL[choose(one.fits, criterion)] for one in drawn]
+        found = [USUAL[best(one.fits, criterion(one.fits))] for one in drawn]
         row[f"{name}_right"] = sum(one is truth for one in found)
         row[f"{name}_richer"] = sum(len(one.names()) > len(truth.names()) for one in found)
     for name in QUANTITIES:

@@ -2,16 +2,14 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 import etid
 from benchmarks.ladder import LOADS, recorded
-from benchmarks.machine import make_room
 from benchmarks.perturbed_study import PARTS, drawn_driver
 from etid.circuits.circuit import AbstractCircuit, ParallelRC, Resistor, SkinCole, SkinRC
 from etid.identify.arguments import fed
@@ -101,34 +99,28 @@ def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Sele
 
 def draws(snr_db: float, number: int) -> list[Drawn]:
     """One recording of each truth behind a driver [dB]; none if the driver is not identified."""
-    with jax.enable_x64(True):  # of a worker process
-        study = scene(snr_db, number).simulate(number)
-        driver = etid.identify_driver(study["calibration"], throw=False)
-        if driver.verdict != "successful":
-            return []
-        records = [study[name] for name in TRUTHS]
-        chosen = choices(records, driver)
-        fits = [dict(one.fits) for one in chosen]
-        for candidate, circuit in enumerate(usual_circuits()):
-            rows = [row for row, of in enumerate(fits) if candidate not in of]
-            if rows:
-                more = etid.identify_skins([records[row] for row in rows], driver, circuit=circuit)
-                for place, row in enumerate(rows):
-                    fits[row][candidate] = more[place]
-        make_room()
-        of_all = zip(TRUTHS, chosen, fits, strict=True)
-        return [Drawn(name, snr_db, number, one, of) for name, one, of in of_all]
+    study = scene(snr_db, number).simulate(number)
+    driver = etid.identify_driver(study["calibration"], throw=False)
+    if driver.verdict != "successful":
+        return []
+    records = [study[name] for name in TRUTHS]
+    chosen = choices(records, driver)
+    fits = [dict(one.fits) for one in chosen]
+    for candidate, circuit in enumerate(usual_circuits()):
+        rows = [row for row, of in enumerate(fits) if candidate not in of]
+        if rows:
+            more = etid.identify_skins([records[row] for row in rows], driver, circuit=circuit)
+            for place, row in enumerate(rows):
+                fits[row][candidate] = more[place]
+    of_all = zip(TRUTHS, chosen, fits, strict=True)
+    return [Drawn(name, snr_db, number, one, of) for name, one, of in of_all]
 
 
-class Quantity(NamedTuple):
-    """A number that circuits have in common, and its slope with respect to their elements."""
+def quantities(circuit: AbstractCircuit) -> dict[str, tuple[float, np.ndarray]]:
+    """R_s and Z(0) [ohm], and the logarithm of the corner frequency, where a circuit has them.
 
-    value: float
-    slope: Float[np.ndarray, " element"]
-
-
-def quantities(circuit: AbstractCircuit) -> dict[str, Quantity]:
-    """R_s and Z(0) [ohm], and the logarithm of the corner frequency, where a circuit has them."""
+    Beside each stand its derivatives with respect to the elements.
+    """
     names, units = circuit.names(), circuit.units()
 
     def found(values: Array) -> dict[str, Array]:
@@ -143,7 +135,7 @@ def quantities(circuit: AbstractCircuit) -> dict[str, Quantity]:
 
     values = jnp.asarray(circuit.values())
     slopes = jax.jacfwd(found)(values)
-    return {of: Quantity(float(v), np.asarray(slopes[of])) for of, v in found(values).items()}
+    return {of: (float(v), np.asarray(slopes[of])) for of, v in found(values).items()}
 
 
 def errors(drawn: Drawn) -> dict[str, float]:
@@ -155,7 +147,7 @@ def errors(drawn: Drawn) -> dict[str, float]:
     fit, true = drawn.selection.fit, quantities(TRUTHS[drawn.truth])
     cov = np.asarray(fit.cov)
     return {
-        name: (found.value - true[name].value) / float(np.sqrt(found.slope @ cov @ found.slope))
-        for name, found in quantities(fit.circuit).items()
+        name: (value - true[name][0]) / float(np.sqrt(slope @ cov @ slope))
+        for name, (value, slope) in quantities(fit.circuit).items()
         if name in true
     }

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 import etid
-from benchmarks.rivals import exchange, install
+from benchmarks.rivals import exchange
 from benchmarks.rivals.records import ALIASED
 from benchmarks.selection_draws import TRUTHS, scene
 from etid.estimators.lanes import Harmonics
@@ -25,8 +25,6 @@ from etid.recordings.preflight import Inspected
 from etid.selection.evidence import best
 from etid.selection.search import USUAL, usual_circuits
 
-ENVIRONMENT_OF = "impedance_py"  # of `benchmarks.rivals.roster`
-WORKER = "benchmarks.rivals.circuits_by_impedance_py"
 NAMES = np.array([kind.__name__ for kind in USUAL])
 
 
@@ -109,15 +107,11 @@ def by_etid(every: Sequence[Spectra]) -> Chosen:
     return by_truth(names, seconds)
 
 
-def missing() -> str:
-    """Why there is no rival; empty if it is installed."""
-    return next(iter(install([ENVIRONMENT_OF]).values()), "")
-
-
 def by_impedance_py(every: Sequence[Spectra]) -> Chosen:
     """What the rival chooses."""
     z, sigma, used = (np.concatenate([one[i] for one in every]) for i in (1, 2, 3))
-    found = exchange("common", WORKER, f=every[0].f, z=z, sigma=sigma, used=used)
+    worker = "circuits_by_impedance_py"
+    found = exchange("common", worker, f=every[0].f, z=z, sigma=sigma, used=used)
     return by_truth(NAMES[np.argmin(found["bic"], axis=1)], found["seconds"])
 
 

@@ -66,12 +66,10 @@ def kinds() -> dict[str, Kind]:
             "npz": Kind(".npz", (_archive(),), _by(damage.damaged_npz), _use_import),
             "matlab": Kind(".mat", (_matlab73(place),), _either, _use_import),
         }
-        with contextlib.suppress(ImportError):
-            found["matlab5"] = Kind(".mat", (_matlab5(),), _bytes, _use_import)
-        with contextlib.suppress(ImportError):
-            found["tdms"] = Kind(".tdms", (_tdms(place),), _bytes, _use_import)
-        with contextlib.suppress(ImportError):
-            found["abf"] = Kind(".abf", (_abf(place),), _bytes, _use_import)
+        extras = {"matlab5": (".mat", _matlab5), "tdms": (".tdms", _tdms), "abf": (".abf", _abf)}
+        for name, (suffix, make) in extras.items():
+            with contextlib.suppress(ImportError):
+                found[name] = Kind(suffix, (make(place),), _bytes, _use_import)
     return found
 
 
@@ -268,7 +266,7 @@ def _matlab73(folder: pathlib.Path) -> bytes:
     return path.read_bytes()
 
 
-def _matlab5() -> bytes:
+def _matlab5(_: pathlib.Path) -> bytes:
     import scipy.io
 
     buffer = io.BytesIO()

@@ -1,13 +1,11 @@
 """Measured impedances without standard errors: good ones, and ones with a fault that must be told.
 
 Every spectrum has 61 frequencies in 3 to 6 decades around the corners of a drawn circuit, with
-white noise of 0.1 to 3 % of |Z|. `FAULTS` are what instruments, cables and people do to it. A fit
-that is called successful is *silent* if an element is wrong by more than five standard errors and
-by more than 2 %, or if the spectrum is none (the sign of Im Z is wrong, or the phase is missing).
-
-Of a circuit that is fitted to another one, the elements that both have are compared. An element
-that drifts during the sweep has every value that it passes. Good spectra have 20, 61 and 100
-frequencies; printed are the refused ones and the part of the 95 % intervals that hold the truth.
+white noise of 0.1 to 3 % of |Z|; good ones have 20, 61 and 100. A fit that is called successful is
+*silent* if an element is wrong by more than five standard errors and by more than 2 %, or if the
+spectrum is none (the sign of Im Z is wrong, or the phase is missing). Of a circuit that is fitted
+to another one, the elements that both have are compared. An element that drifts during the sweep
+has every value that it passes.
 """
 
 import argparse
@@ -196,7 +194,6 @@ class Answer(NamedTuple):
     # errors of the elements that have right values, in standard errors
     z: Float[np.ndarray, " element"]
     silent: bool  # whether the fit is called successful, and is wrong
-    rrse: float  # of the fit
 
 
 def answer(of: Spectrum) -> Answer:
@@ -212,7 +209,7 @@ def answer(of: Spectrum) -> Answer:
     right = np.clip(value, *np.reshape([of.truth[name] for name in names], (-1, 2)).T)
     z, relative = (value - right) / stderr, (value - right) / right
     wrong = ((np.abs(z) > SILENT) & (np.abs(relative) > NOTICED)).any() or not names
-    return Answer(fit.verdict, z, fit.verdict == "successful" and bool(wrong), float(fit.rrse))
+    return Answer(fit.verdict, z, fit.verdict == "successful" and bool(wrong))
 
 
 OPTIONS = (
@@ -230,7 +227,7 @@ def with_fault(seed: int, spectra: int) -> Iterator[Target]:
         wrong = [one for one, said in zip(seeds, answers, strict=True) if said.silent]
         counts = counted(np.array([one.verdict for one in answers]))
         text = f"{len(wrong)} silent {wrong or ''}; {counts}"
-        yield Target(f"{name}: silent", len(wrong), *TARGETS["silent"], text)
+        yield Target.of(TARGETS, "silent", len(wrong), f"{name}: ", text=text)
 
 
 def without_fault(seed: int, spectra: int) -> Iterator[Target]:
@@ -249,11 +246,11 @@ def without_fault(seed: int, spectra: int) -> Iterator[Target]:
             (refused / len(answers), f"{refused} of {len(answers)}; {counted(verdicts)}", None),
             (float(inside.mean()), f"{inside.mean():.4f}, {rms}", interval),
         )
-        for (name, limits), (value, text, scatter) in zip(TARGETS.items(), values, strict=True):
-            yield Target(f"good, {points} frequencies: {name}", value, *limits, text, scatter)
+        of = f"good, {points} frequencies: "
+        for name, (value, text, scatter) in zip(TARGETS, values, strict=True):
+            yield Target.of(TARGETS, name, value, of, text=text, interval=scatter)
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print verdicts and coverage; whether nothing is silent, and good spectra are accepted."""
     of = arguments
     return report([*with_fault(of.seed, of.spectra), *without_fault(of.seed, of.good)])

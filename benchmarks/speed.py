@@ -145,7 +145,6 @@ def in_new_processes() -> Iterator[Target]:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print all lines; whether every target is met."""
     quick = arguments.quick
     lanes, repeats = (8, 3) if quick else (98, 7)
     targets = [*in_new_processes(), *filters(5 * repeats)]

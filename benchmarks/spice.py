@@ -66,7 +66,6 @@ ESTIMATORS: tuple[str, ...] = (*names(), JOINT)
 DATA = option(
     "--data",
     default=pathlib.Path("../shared/data"),
-    type=pathlib.Path,
     help=f"folder that has {FOLDER}/, recordings with known truth",
 )
 OPTIONS = (
@@ -135,7 +134,6 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Fit the scenes, print the table, write it as CSV."""
     folder = arguments.data / FOLDER
     if not folder.exists():
         raise SystemExit(f"no SPICE recordings at {folder}; pass their parent folder with --data")

@@ -103,12 +103,7 @@ def information(
     return 2 * np.real(np.conj(rest.T) @ rest)
 
 
-def deviations(load: SkinLoad, snr_db: float, change: Change) -> float:
-    """Standard deviations at which the best test sees a change behind a skin."""
-    return float(1 / np.sqrt(np.linalg.inv(information(load, snr_db, BAND, change))[-1, -1]))
-
-
 def missed(load: SkinLoad, snr_db: float, change: Change) -> float:
     """Probability that the best test misses a change behind a skin."""
-    at = deviations(load, snr_db, change)
+    at = 1 / np.sqrt(np.linalg.inv(information(load, snr_db, BAND, change))[-1, -1])
     return float(scipy.stats.norm.cdf(LIMIT - at) - scipy.stats.norm.cdf(-LIMIT - at))

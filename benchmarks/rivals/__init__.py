@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import venv
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -70,12 +70,6 @@ def _requirements(environment: str) -> tuple[pathlib.Path, pathlib.Path]:
     return REQUIREMENTS / name, ENVIRONMENTS / environment / name
 
 
-def install(names: Iterable[str]) -> dict[str, str]:
-    """Make the environments of some rivals; by environment why one could not be made."""
-    made = {name: make(name) for name in dict.fromkeys(RIVALS[one].environment for one in names)}
-    return {environment: why for environment, why in made.items() if why}
-
-
 def make(environment: str) -> str:
     """Make an environment unless it is there; why it could not be made, or nothing."""
     if installed(environment):
@@ -97,16 +91,18 @@ def exchange(
     timeout: float | None = None,
     **problem: Any,
 ) -> dict[str, np.ndarray]:
-    """What a module that calls `serve` makes of arrays, in a process of its own.
+    """What a module beside this, which calls `serve`, makes of arrays in a process of its own.
 
-    Raises:
-        RivalError: It failed, or took longer than the timeout [s].
+    A `RivalError` says why it does not, or not within the timeout [s].
     """
+    missing = "" if python else make(environment)
+    if missing:
+        raise RivalError(missing)
     with tempfile.TemporaryDirectory() as folder:
         given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
         np.savez(given, **problem)
         process = subprocess.Popen(
-            [python or python_of(environment), "-m", module, given, found],
+            [python or python_of(environment), "-m", f"{__name__}.{module}", given, found],
             cwd=ROOT,
             env={**os.environ, **SETTINGS},
             stdout=subprocess.DEVNULL,
@@ -156,7 +152,7 @@ def run(
             return Outcome(missing=f"{program} not found: apt-get install {packages}")
     asked = {"name": name, "repeats": repeats, "budget": budget, **problem}
     try:
-        found = exchange(rival.environment, "benchmarks.rivals.worker", python, timeout, **asked)
+        found = exchange(rival.environment, "worker", python, timeout, **asked)
     except RivalError as error:
         return Outcome(missing=str(error))
     said = {key: json.loads(str(found.pop(key))) for key in ("versions", "errors")}

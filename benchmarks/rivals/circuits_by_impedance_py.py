@@ -45,7 +45,6 @@ def criterion(name, f, z, sigma):
 
 
 def solved(problem):
-    """Fit all circuits to all spectra."""
     f, z, sigma = problem["f"] / MEGA, problem["z"] / KILO, problem["sigma"] / KILO
     found, seconds = np.full((len(z), len(CIRCUITS)), np.inf), np.zeros(len(z))
     criterion("Resistor", f, z[0], sigma[0])  # what a first call costs is not counted

@@ -6,12 +6,9 @@ returns q and whether its package calls that a success. What has the argument `n
 `jax.numpy` as well.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
-
 import numpy as np
 
-from benchmarks.rivals.records import MICROSECOND, Harmonics, harmonics
+from benchmarks.rivals.records import MICROSECOND, harmonics
 
 DELAY_WIDTH = 2.5  # [µs], of the weak prior of a calibration's delay
 GAIN_WIDTH = 5.0  # [R_L], of the weak prior of the gains of Z_th
@@ -19,12 +16,8 @@ GAIN_WIDTH = 5.0  # [R_L], of the weak prior of the gains of Z_th
 # near or above it; its magnetising inductance is slow. The fit with the smallest misfit is taken.
 RESONANCE, SLOW, OTHERS = 50e3, 30.0, (5e3, 20e3, 150e3)
 
-Fit = Callable[[Callable, np.ndarray, Sequence[Any]], tuple[np.ndarray, bool]]
 
-
-def driver(
-    fit: Fit, v_th: np.ndarray, v_out: np.ndarray, r_load: float, fs: float, f0: float
-) -> tuple[np.ndarray, float]:
+def driver(fit, v_th, v_out, r_load, fs, f0):
     """Parameters of `source_impedance`, and R_L [ohm]."""
     of = harmonics(v_th, v_out, fs, f0)
     found = [fit(driver_misfit, start, of)[0] for start in driver_starts(of)]
@@ -32,15 +25,7 @@ def driver(
     return found[int(np.nanargmin(misfits))], r_load
 
 
-def skin(
-    fit: Fit,
-    v_th: np.ndarray,
-    v_out: np.ndarray,
-    model: tuple[np.ndarray, float],
-    start: np.ndarray,
-    fs: float,
-    f0: float,
-) -> tuple[np.ndarray, bool]:
+def skin(fit, v_th, v_out, model, start, fs, f0):
     """Elements [ohm, ohm, F], and whether the package calls them a success."""
     parameters, r_load = model
     of = harmonics(v_th, v_out, fs, f0)
@@ -49,7 +34,7 @@ def skin(
     return np.exp(q[:3]), ok
 
 
-def skin_misfit(q: Any, f: Any, x: Any, y: Any, sigma: Any, z_th: Any, numpy: Any = np) -> Any:
+def skin_misfit(q, f, x, y, sigma, z_th, numpy=np):
     """Residuals (Y − G X) / (σ √(1 + |G|²)), real parts before imaginary ones: both are noisy.
 
     q holds the logarithms of R_s, R_p [ohm] and C_p [F], and the delay [µs].
@@ -60,7 +45,7 @@ def skin_misfit(q: Any, f: Any, x: Any, y: Any, sigma: Any, z_th: Any, numpy: An
     return _misfit(z / (z + z_th), q[3], f, x, y, sigma, numpy)
 
 
-def source_impedance(q: Any, f: Any, numpy: Any = np) -> Any:
+def source_impedance(q, f, numpy=np):
     """Z_th / R_L of order 5: a resistor, two sections of second order and a slow pole.
 
     e^q0 + Σ_k (g_k + h_k s/ω_k) / (1 + 2 ζ_k s/ω_k + (s/ω_k)²) + g / (1 + s/ω), where q holds
@@ -74,14 +59,14 @@ def source_impedance(q: Any, f: Any, numpy: Any = np) -> Any:
     return z
 
 
-def driver_misfit(q: Any, f: Any, x: Any, y: Any, sigma: Any, numpy: Any = np) -> Any:
+def driver_misfit(q, f, x, y, sigma, numpy=np):
     """The same of a calibration, and weak priors; q as in `source_impedance`, and the delay."""
     gain = 1 / (1 + source_impedance(q, f, numpy))
     priors = numpy.stack([q[11] / DELAY_WIDTH, q[3] / GAIN_WIDTH, q[7] / GAIN_WIDTH])
     return numpy.concatenate([_misfit(gain, q[11], f, x, y, sigma, numpy), priors])
 
 
-def driver_starts(of: Harmonics) -> list[np.ndarray]:
+def driver_starts(of):
     """Generic poles, and the gains that then fit a calibration best, Y Z_th / R_L = X − Y."""
     starts = []
     for other in OTHERS:
@@ -103,7 +88,7 @@ def driver_starts(of: Harmonics) -> list[np.ndarray]:
     return starts
 
 
-def _misfit(gain: Any, delay: Any, f: Any, x: Any, y: Any, sigma: Any, numpy: Any) -> Any:
+def _misfit(gain, delay, f, x, y, sigma, numpy):
     turned = gain * numpy.exp(-2j * np.pi * MICROSECOND * f * delay)
     e = (y - turned * x) / (sigma * numpy.sqrt(1 + numpy.abs(gain) ** 2))
     return numpy.concatenate([e.real, e.imag])

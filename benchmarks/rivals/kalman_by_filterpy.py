@@ -67,12 +67,10 @@ class Display:
 
 
 def parts(values):
-    """Real parts, then imaginary parts."""
     return np.concatenate([np.real(values), np.imag(values)])
 
 
 def solved(problem):
-    """Track the pulses of a problem."""
     display, seconds = Display(problem), []
     for pulse in zip(problem["gains"], problem["variances"], problem["delays"], strict=True):
         begin = time.process_time()

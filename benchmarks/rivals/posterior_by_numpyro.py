@@ -69,7 +69,6 @@ def compared(snr_db, seed):
 
 
 def solved(problem):
-    """Compare some fits."""
     jax.config.update("jax_enable_x64", True)
     rows = [compared(float(problem["snr_db"]), seed) for seed in range(int(problem["fits"]))]
     columns = zip(*(row for row in rows if row is not None), strict=True)

@@ -33,19 +33,14 @@ class Harmonics(NamedTuple):
         return least**2 > VISIBLE * self.sigma**2
 
 
-def whole_periods(samples: int, fs: float, f0: float) -> tuple[int, int]:
-    """How many periods a record holds, and the samples nearest to them."""
-    periods = int((samples + 0.5) * f0 / fs)
-    return periods, min(samples, round(periods * fs / f0))
-
-
 def harmonics(v_th: np.ndarray, v_out: np.ndarray, fs: float, f0: float) -> Harmonics:
     """Coefficients (1/M) Σ v[n] e^(−j2πkPn/M), k ≥ 1, of P periods in M samples, and their noise.
 
     What lies between the harmonics is noise. A single period has nothing between them: the last
     tenth of its band is taken for noise, where an anti-alias filter leaves least.
     """
-    periods, samples = whole_periods(v_th.size, fs, f0)
+    periods = int((v_th.size + 0.5) * f0 / fs)
+    samples = min(v_th.size, round(periods * fs / f0))
     spectra = np.fft.rfft(np.stack([v_th, v_out])[:, :samples])[:, 1 : (samples + 1) // 2] / samples
     bins = np.arange(1, spectra.shape[1] + 1)
     of_pulse = bins % periods == 0
@@ -57,17 +52,13 @@ def harmonics(v_th: np.ndarray, v_out: np.ndarray, fs: float, f0: float) -> Harm
     return Harmonics(bins[of_pulse] * fs / samples, x, y, sigma)
 
 
-def driver_impedance(of: Harmonics, r_load: float) -> np.ndarray:
-    """Z_th = R_L (X − Y) / Y at every harmonic [ohm]; NaN where noise hides it."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(of.visible, r_load * (of.x - of.y) / of.y, np.nan)
-
-
 def measured_driver(
     v_th: np.ndarray, v_out: np.ndarray, r_load: float, fs: float, f0: float
 ) -> np.ndarray:
-    """The same from records: `driver` of the rivals that take Z_th as measured."""
-    return driver_impedance(harmonics(v_th, v_out, fs, f0), r_load)
+    """Z_th = R_L (X − Y) / Y at every harmonic of a calibration [ohm]; NaN where noise hides it."""
+    of = harmonics(v_th, v_out, fs, f0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(of.visible, r_load * (of.x - of.y) / of.y, np.nan)
 
 
 def load_impedance(of: Harmonics, z_th: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

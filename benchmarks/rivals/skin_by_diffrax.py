@@ -107,7 +107,6 @@ def timed(function, logs):
 
 
 def solved(given):
-    """Solve a problem with all methods and tolerances."""
     jax.config.update("jax_enable_x64", True)
     logs, rows = jnp.asarray(given["logs"]), []
     for method, tolerance in zip(given["methods"], given["tolerances"], strict=True):

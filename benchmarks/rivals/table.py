@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 import etid
 from benchmarks.ladder import CALIBRATION, START, TRIAL, rung
-from benchmarks.rivals import Outcome, install, problem, run
+from benchmarks.rivals import Outcome, make, problem, run
 from benchmarks.rivals.roster import RIVALS, SCENES
 from benchmarks.runner import option
 from etid.simulation.scenes import Scene
@@ -52,12 +52,12 @@ def line(name: str, outcome: Outcome, truth: np.ndarray | Iterable[float]) -> tu
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Install, run each rival where it should work, print; whether none is missing or wrong."""
     names = arguments.rivals or list(RIVALS)
     unknown = sorted({*names} - {*RIVALS})
     if unknown:
         raise SystemExit(f"no rivals {', '.join(unknown)}; there are {', '.join(RIVALS)}")
-    failed, lines = install(names), list[tuple[str, bool]]()
+    environments = dict.fromkeys(RIVALS[name].environment for name in names)
+    failed, lines = {of: make(of) for of in environments}, list[tuple[str, bool]]()
     scenes = {label: rung("dry", **settings) for label, settings in SCENES.items()}
     given = {
         label: problem(pairs(scenes[label], arguments.draws), START)
@@ -65,7 +65,7 @@ def main(arguments: argparse.Namespace) -> bool:
     }
     for name in tqdm(names):
         rival = RIVALS[name]
-        if rival.environment in failed:
+        if failed[rival.environment]:
             outcome = Outcome(missing=failed[rival.environment])
         else:
             outcome = run(name, given[rival.works], arguments.repeats, arguments.timeout)
