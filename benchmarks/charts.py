@@ -64,7 +64,8 @@ def shares(
             left = [begin + more for begin, more in zip(left, width, strict=True)]
         for place, row in enumerate(rows):
             text = (texts or {}).get((name, row), "")
-            axis.text(1, place, text, va="center", fontsize=6.5)
+            face = {"facecolor": "white", "edgecolor": "none", "pad": 1, "alpha": 0.85}
+            axis.text(2, place, text, va="center", fontsize=6.5, bbox=face if text else None)
         axis.set_xlim(0, 100)
         axis.set_title(name, fontsize=9)
         axis.grid(False)

@@ -32,6 +32,7 @@ SLOW = {  # compiled for minutes, or with a profile and draws
     "online",
     "selection",
     "uncertainties",
+    "instrument",
 }
 PAGES = [
     pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else [])

@@ -9,8 +9,7 @@ from etid.commands import Outcome
 from etid.recordings.replacing import HDF5, replace_text
 from etid.simulation import scenes
 
-# No recording of any preset is `changed`. The test for a change has one false alarm in a thousand
-# recordings: of `paper_dry` seed 0 has one.
+# No recording of any preset is refused by chance, as one in 10 000 is by each test.
 SEED = 2
 
 

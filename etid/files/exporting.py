@@ -45,7 +45,7 @@ def export_fits(
       begins as a formula does, with `=`, `+`, `-` or `@`, gets an apostrophe in front of it.
     - `.parquet`: the same columns; their names have no unit. The metadata of a column contain its
       `unit`. The metadata of the file contain `circuit`, `method` and `etid_version`. This format
-      needs `pip install etid[parquet]`.
+      needs the extra `parquet`.
 
     The covariances are not exported. At most 65536 fits are in memory at a time.
 
@@ -249,7 +249,7 @@ def export_study(
     TimeSeries. A file of recordings does not contain the start times of the recordings, so
     `starting_time` is always 0.
 
-    One record at a time is in memory. The export needs `pip install etid[nwb]`.
+    One record at a time is in memory. The export needs the extra `nwb`.
 
     Args:
         source: File of recordings.

@@ -56,15 +56,15 @@ def import_file(
 
     - `.csv`: comma-separated columns with a header line, one trial.
     - `.mat`: variables of shape (time,) or (trial, time). `a.b` is field b of structure a.
-    - `.tdms`: channels `group/channel` of NI files. They need `pip install etid[tdms]`.
-    - `.abf`: ADC channels of Axon files; sweeps become trials. They need `pip install etid[abf]`.
+    - `.tdms`: channels `group/channel` of NI files. They need the extra `tdms`.
+    - `.abf`: ADC channels of Axon files; sweeps become trials. They need the extra `abf`.
     - `.npz`: arrays of shape (time,) or (trial, time). If the arrays are those of
       `etid.files.readers.npz.own_mapping`, the file contains all fields: only labels can be given,
       without `trial`, and the default condition is the name of the file.
     - `.wav`: channels `1`, `2`, …, as fractions of full scale.
     - `.lvm`: channels of a LabVIEW measurement file.
     - `.xlsx`: columns with a header line; `sheet/column` for the second and further sheets. They
-      need `pip install etid[excel]`.
+      need the extra `excel`.
 
     With `split`, one long record becomes several trials: `"pulses"` splits it at the pauses between
     its pulses, the name of a trigger channel at the rising edges of the trigger. Files of

@@ -314,4 +314,6 @@ def _recordings(fits: Fits, waveforms: Section) -> Section:
             f" {study_tables.SINGLE} of {len(fits)} recordings are shown: those without success, "
             "and every few of the others. The file of fits has all."
         )
-    return Section("Recordings", text, (study_tables.recordings(fits, links),))
+    table = study_tables.recordings(fits, links)
+    folded = len(table.rows) > study_tables.FOLDED
+    return Section("Recordings", text, (dataclasses.replace(table, folded=folded),))

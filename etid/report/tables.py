@@ -22,6 +22,7 @@ from etid.results.verdicts import message, own_part
 ROWS = 100  # largest number of rows of a table
 CONDITIONS = 30  # largest number of conditions in a table
 SINGLE = 3000  # largest number of rows of the table of recordings
+FOLDED = 30  # rows of it from which on the page shows it when the reader asks for it
 
 
 def significant(value: float, digits: int = 2) -> str:
