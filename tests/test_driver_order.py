@@ -144,5 +144,7 @@ def test_a_driver_tells_the_start_that_led_to_it(monkeypatch, method):
     monkeypatch.setattr(refined_driver, "source_starts", reversed_starts)
     monkeypatch.setattr(identify, "_identified", program(inspect.unwrap(identify._identified)))
     turned = etid.identify_driver(calibration, order=3, method=method, throw=False)
+    assert isinstance(told, ContinuousDriver)
+    assert isinstance(turned, ContinuousDriver)
     assert turned.start == counts[0] - 1 - told.start
     assert float(turned.chi2) == pytest.approx(float(told.chi2), rel=1e-6)  # the same minimum

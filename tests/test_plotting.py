@@ -1,6 +1,7 @@
 """Pictures: each as its image, what its axes say, and what is refused."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -234,12 +235,13 @@ def test_panels_of_a_narrow_figure_stand_below_each_other(recording, driver):
     import matplotlib.pyplot as plt
 
     fit = pictures.fit()
-    for of, show, size, rows in (
+    calls: list[tuple[Any, Any, tuple[float, float], int]] = [
         ([recording], "pulse", (3.3, 3.6), 2),
         ([recording], "pulse", (6.6, 3.6), 1),
         ([fit, recording, driver], "impedance", (3.3, 6.0), 3),
         ([fit, recording, driver], "residual", (12.0, 4.0), 1),
-    ):
+    ]
+    for of, show, size, rows in calls:
         axes = etid.plot(*of, show=show, size=size, title=None)
         figure = axes[0].figure
         figure.canvas.draw()
