@@ -223,7 +223,7 @@ OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
         ("fit garbage.h5 -o fits.h5", "garbage.h5: is not an HDF5 file"),
         ("fit calibration.h5 -o fits.h5", "no loaded recording"),
         ("import absent.csv -o out.h5", "absent.csv: there is no such file"),
-        ("import table.csv -o out.h5", "v_th: is not given"),
+        ("import table.csv -o out.h5", "v_th, v_out, pulse_rate, scale: are not given"),
         (f"import table.csv -o s.h5 {OPEN}", "v_out: is channel 'open', and so is v_th"),
         ("fit study.h5 -o absent/f.h5", "absent/f.h5: the folder of this file does not exist"),
         ("simulate paper_dry -o absent/s.h5", "absent/s.h5: the folder of this file"),
@@ -272,7 +272,7 @@ def test_the_file_that_is_read_is_never_replaced(run, study_file, command):
 def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
     run, study_file, tmp_path, monkeypatch
 ):
-    def calibrated(records, former):
+    def calibrated(records, order, former):
         driver = etid.identify_driver(records, method="equation_error", throw=False)
         return CheckedCalibration(driver, [1e-3], {})
 

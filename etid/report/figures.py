@@ -168,6 +168,9 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
     names = list(dict.fromkeys(one.name for one in found))
     parts = list(found[0].parts)
     figure, axes = new_figure(1, len(names), (3.4 * len(names) + 1, 2.6), sharey=True)
+    for axis, name in zip(axes[0], names, strict=True):
+        # Before the first point: an axis that has none would keep the limits of a linear one.
+        axis.set(xscale="log", xlabel=f"{symbol(name, '1')}: part of the median [%]")
     for one in found:
         if one.condition not in conditions:
             continue
@@ -179,8 +182,7 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
             sizes[shown], place[shown], MARKS[series], color=COLOURS[series], ms=6,
             label=plain(_short(one.condition)) or "all",
         )  # fmt: skip
-    for axis, name in zip(axes[0], names, strict=True):
-        axis.set(xscale="log", xlabel=f"{symbol(name, '1')}: part of the median [%]")
+    for axis in axes[0]:
         low, high = axis.dataLim.intervalx
         if 0 < low <= high < np.inf:
             axis.set_xlim(low / NARROW, high * NARROW)

@@ -71,18 +71,20 @@ def drivers(
     frequency = jax.device_put(np.array([1e3]))
     chosen = sorted(found.items(), key=lambda item: (item[1].verdict == "successful", item[0]))
     for paths, driver in chosen[: max(0, ROWS - len(rows))]:
-        z, error = driver.response(frequency)[0], driver.response_stderr(frequency)[0]
-        resistors = driver.calibration.r_load if isinstance(driver, ContinuousDriver) else ()
+        # As NumPy's, for JAX compiles each part that is taken of its arrays.
+        z, error = map(np.asarray, (driver.response(frequency), driver.response_stderr(frequency)))
+        own = driver.calibration.r_load if isinstance(driver, ContinuousDriver) else ()
+        resistors = np.asarray(own).tolist()
         rows.append(
             (
                 _calibrations(paths),
-                ", ".join(f"{float(r) / 1e3:.6g}" for r in resistors),
+                ", ".join(f"{r / 1e3:.6g}" for r in resistors),
                 str(driver.order),
                 driver.method,
                 driver.verdict,
                 significant(100 * float(driver.rrse)),
                 significant(float(driver.chi2), 3),
-                element(abs(complex(z)), float(error), 1e3),
+                element(abs(complex(z[0])), float(error[0]), 1e3),
                 message(driver.verdict),
             )
         )

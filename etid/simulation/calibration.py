@@ -72,13 +72,15 @@ class CheckedCalibration(Overviewed):
             "standard errors to expect of skin:",
             rows,
             ("skin", "recorded", *SkinRC().names()),
-            notes=[self._what_helps(), *self._since()],
+            notes=[*self._what_helps(), *self._since()],
         )
         known = Overview(several(len(records), "calibration") + ":", records, heads)
         return dataclasses.replace(self.driver._overview(), then=(known, errors))
 
-    def _what_helps(self) -> str:
+    def _what_helps(self) -> list[str]:
         """What makes the largest error smaller, and how many periods make it 1 %."""
+        if not self.expected:
+            return []
         error, skin, name = max(
             (error, skin, name)
             for skin, by in self.expected.items()
@@ -89,7 +91,7 @@ class CheckedCalibration(Overviewed):
         )
         text = f"{name} of {skin} skin is least known; {what} helps most: {100 * then:.2g} %"
         times = np.ceil((error / GOAL) ** 2)
-        return text + (f"; 1 % takes {times:.0f} times as many periods" if times > 1 else "")
+        return [text + (f"; 1 % takes {times:.0f} times as many periods" if times > 1 else "")]
 
     def _since(self) -> list[str]:
         if not np.isfinite(self.moved):
