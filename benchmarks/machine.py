@@ -37,7 +37,8 @@ def provenance() -> dict[str, str]:
 
 def _commit() -> str:
     """The commit, with a + if the working tree differs from it, other than by results of a run."""
-    changed = ["git", "diff", "--name-only", "HEAD", "--", ".", f":!{RESULTS}"]
+    results = RESULTS.relative_to(ROOT)  # `:!/…` would mean something else to git
+    changed = ["git", "diff", "--name-only", "HEAD", "--", ".", f":!{results}"]
     try:
         commit, names = (
             subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout

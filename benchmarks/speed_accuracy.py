@@ -2,9 +2,9 @@
 
 An error is that of the elements over their Cramer-Rao bounds, the median over draws with a
 calibration of their own and its 95 % interval; a time is that of one skin from its samples, the
-driver known, compilation apart, on one core. The default has all draws, other methods as many as a
-budget allows. Rivals have their own environments (`python -m benchmarks rivals`); one that has none
-is in the table with the reason.
+driver known, compilation apart, on one core. Methods with the driver of the default or of maximum
+likelihood have all draws, others as many as a budget allows. Rivals have environments of their own
+(`python -m benchmarks rivals`); one that has none is in the table with the reason.
 """
 
 import argparse
@@ -29,9 +29,9 @@ from etid.simulation.scenes import Scene
 
 PINNED = True
 FILE = "speed_accuracy.csv"
-BUDGET = 60.0  # [s] for the draws of one method other than the default in one scene
-TIMED = 6.0  # [s] for a timed batch, and for a rival in one scene
-BATCH = 32  # recordings of a timed batch
+BUDGET = 60.0  # [s] for the draws of a method with a driver of its own in one scene
+TIMED = 6.0  # [s] for a timed batch that NumPy runs, and for a rival in one scene
+BATCH = 512  # recordings of a timed batch; so many are compiled
 PATIENCE = 30  # budgets that a rival may take for all it has begun
 FEWEST, OF_RIVALS = 4, 24  # draws, however long they take; at most
 PRINTED = (
@@ -40,7 +40,6 @@ PRINTED = (
 )
 SHOWN = ("dry, 80 dB", "dry, 60 dB", "dry, 30 dB", "damp, 60 dB", "damp, 40 dB", "dry, 1 MHz")
 FEW, FEW_REPETITIONS = ("dry, 60 dB", "damp, 40 dB"), 5
-SIGNIFICANT = 2.0  # standard errors of a paired difference
 TARGETS = {
     "estimators that beat the default": at_most(0),
     "part of the draws in which the default is wrong silently": at_most(0),
@@ -120,15 +119,18 @@ class Result(NamedTuple):
 
 def median_interval(values: np.ndarray) -> tuple[float, float]:
     """The order statistics between which the median of the population lies, by the signs alone."""
-    ranks = scipy.stats.binom.interval(LEVEL, values.size, 0.5)
-    low, high = np.sort(values)[np.clip(np.array(ranks, int), 0, values.size - 1)]
+    below, above = scipy.stats.binom.interval(LEVEL, values.size, 0.5)  # values below the median
+    ranks = np.array([below - 1, above], int).clip(0, values.size - 1)
+    low, high = np.sort(values)[ranks]
     return float(low), float(high)
 
 
 def ours(draws: Draws, drivers: Drivers, name: str) -> Iterator[Result]:
     """One of our estimators, alone and batched; after its budget other draws are left out."""
     method, begin = method_of(name), np.inf
-    budget = np.inf if name == DEFAULT else BUDGET
+    kind, default = (drivers.kind([draws.studies[0][CALIBRATION]], of) for of in (name, DEFAULT))
+    on_harmonics = kind == "maximum_likelihood"
+    budget = np.inf if on_harmonics or kind == default else BUDGET
     answers, usable, times = [], [], []
     for seed, study in enumerate(draws.studies):
         if len(answers) >= FEWEST and time.perf_counter() - begin > budget:
@@ -150,14 +152,14 @@ def ours(draws: Draws, drivers: Drivers, name: str) -> Iterator[Result]:
         answers.append(draws.answer(name, seed, fit.verdict, *said))
         begin = min(begin, time.perf_counter())
     first, seconds = (times[0], float(np.median(times[1:]))) if times else (np.nan, np.nan)
-    own = drivers.times.get(drivers.kind([draws.studies[0][CALIBRATION]], name), [])[1:]
+    own = drivers.times.get(kind, [])[1:]
     driver_seconds = float(np.median(own)) if own else np.nan
     alone = Result(name, "alone", answers, seconds, first, driver_seconds)
     yield alone
     if usable:
         # One driver for all: it is the time that is measured.
         known = usable[0][1]
-        count = max(1, min(BATCH, round(TIMED / 3 / seconds)))
+        count = BATCH if on_harmonics else max(1, round(TIMED / 3 / seconds))
         batch = [usable[i % len(usable)][0] for i in range(count)]
         several = [
             timed(lambda: etid.identify_skins(batch, known, method=method))[1] for _ in range(3)
@@ -247,7 +249,8 @@ def dominators(results: Sequence[Result]) -> list[str]:
         if not of.seconds < own.seconds or not np.isfinite(a).all():
             continue
         gain = np.log(b) - np.log(a)
-        if np.mean(gain) > SIGNIFICANT * np.std(gain, ddof=1) / np.sqrt(size):
+        far = scipy.stats.t.isf((1 - LEVEL) / 2, size - 1) * np.std(gain, ddof=1) / np.sqrt(size)
+        if np.mean(gain) > far:  # of two draws it has to be far
             found.append(of.estimator)
     return found
 
