@@ -5,9 +5,9 @@ the fits and of their drivers, whose standard deviations s and a are known:
 
     y = μ + Σ_r Z_r u_r + e + A d,    u_r ~ N(0, σ_r²),    e ~ N(0, diag(s²)),    d ~ N(0, 1).
 
-A has a column for each driver, with a of its fits: they share one error. σ_r are those of the
-largest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971, 545-554), their
-intervals those of its profile. It needs no balanced design.
+A has a column for each driver, with a, the root mean square of its fits: they share one error. σ_r
+are those of the largest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971,
+545-554), their intervals those of its profile. It needs no balanced design.
 """
 
 import dataclasses
@@ -130,7 +130,9 @@ def variation(
     if len(values) < 2 or not levels:
         raise ValueError(f"{len(values)} successful fits show no variation by {', '.join(by)}")
     names = good.labels[driver].astype(str) if driver else np.zeros(y.size)
-    drivers = a[:, None] * (names[:, None] == np.unique(names))
+    member = (names[:, None] == np.unique(names)).astype(float)
+    # One error for a driver: that of each fit grows with its element, and would explain it.
+    drivers = member * np.sqrt(a**2 @ member / member.sum(0))
     model = _Model.of(y, s, list(levels.values()), drivers)
     best, mean, stderr = model.fitted()
     between = {}
