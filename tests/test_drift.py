@@ -37,7 +37,7 @@ def recorded(source: SourceImpedance, number: int):
             return v_th
         return v_th * loading(trial.load(f), np.asarray(source.response(jnp.asarray(f))))
 
-    trial = Trial(f"loaded/{number}", DRY)
+    trial = Trial(f"loaded/{number}", LOADS["dry"])
     return Scene((trial,), trigger_jitter_rms=50e-9).record(3, voltage)[trial.path]
 
 
