@@ -1,8 +1,9 @@
 """What must hold at the end of the notebook.
 
 Elements are compared with those that were drawn. All fits of a day share its driver, so their
-errors are not independent, but the largest of 576 errors is below six standard errors. A verdict
-refuses few good recordings. The variance between electrodes is that of what was drawn.
+errors are not independent, but the largest of 1 163 errors is below six standard errors. A verdict
+refuses few good recordings. The variance between electrodes is that of what was drawn, but for the
+error of a driver: it grows with R_p, and so stretches all differences of a day alike.
 """
 
 # The names are those of the notebook.
@@ -13,7 +14,7 @@ keys = [
     for row in range(len(fits))
 ]
 lost = fits.labels["electrode"] == "E15"
-assert len(fits) == len(true) == len(SUBJECTS) * len(SITES) * len(DAYS) * len(ROWS)
+assert len(fits) == len(true) == len(SUBJECTS) * len(SITES) * len(DAYS) * 98
 assert set(fits.verdicts[lost]) == {"unconnected"}
 good = ~lost & (fits.verdicts == "successful")
 assert np.sum(~lost & ~good) <= 3
@@ -26,5 +27,6 @@ groups = {key[:3] for key in keys}
 of = [key[:3] for row, key in enumerate(keys) if not lost[row]]
 within = [np.var(drawn[[one == group for one in of]], ddof=1) for group in groups]
 part = variation.between["recordings"]
-assert part.low < np.sqrt(np.mean(within)) < part.high
+stretched = 3 * variation.driver_error  # three standard deviations of the driver's relative error
+assert part.low / (1 + stretched) < np.sqrt(np.mean(within)) < part.high * (1 + stretched)
 assert part.std > 4 * variation.error
