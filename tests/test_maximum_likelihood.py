@@ -22,7 +22,7 @@ from etid.identify.fitting import known_of, skin_lane
 from etid.identify.options import Options, plan
 from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import Spectrum
-from etid.simulation.scenes import Scene, Trial
+from etid.simulation.scenes import Scene, Trial, paper_calibration
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from etid.solvers.matrices import inverse_root
 from tests import kept_numbers
@@ -62,6 +62,17 @@ def test_the_driver_is_the_transformers_impedance_within_its_error(driver):
     stderr = np.asarray(driver.response_stderr(frequency))
     assert (np.abs(off) < SIGMAS * stderr).all()
     assert (stderr < 0.02 * true).all()
+
+
+@pytest.mark.parametrize("seed", [102, 173])  # the two of 200 where the noise leads astray
+def test_noise_where_the_pulse_has_no_power_does_not_lead_a_driver_astray(seed):
+    """With the harmonics below the noise, Z_th was wrong by 12 and 16 standard errors."""
+    scene = paper_calibration(snr_db=30.0, samples=SAMPLES, trigger_jitter_rms=50e-9)
+    driver = etid.identify_driver([*scene.simulate(seed).values()], order=5)
+    frequency = np.array([1e3, 3e3, 8e3, 2e4])
+    off = np.abs(np.asarray(driver.response(frequency)) - scene.driver.z_th(frequency))
+    assert driver.verdict == "successful"
+    assert (off < SIGMAS * np.asarray(driver.response_stderr(frequency))).all()
 
 
 def test_trigger_delays_of_a_tenth_of_a_sample_leave_every_trial_within_its_error(study, driver):
@@ -195,16 +206,16 @@ def test_the_search_at_the_knots_ends_at_the_minimum_of_all_harmonics(study, dri
 
 
 def test_a_driver_that_is_followed_too_far_is_no_success():
-    """At 24 dB a calibration leaves much of Z_th open; of 120 fits two went beyond it."""
-    trials = tuple(Trial(f"loaded/{i}", DAMP) for i in range(2))
+    """At 20 dB a calibration leaves much of Z_th open; of 120 fits three went beyond it."""
+    trials = tuple(Trial(f"loaded/{i}", DRY) for i in range(2))
     known = (Trial("c", ResistorLoad(98.8e3)),)
-    scene = Scene(trials, known, samples=SAMPLES, snr_db=24.0, trigger_jitter_rms=50e-9)
+    scene = Scene(trials, known, samples=SAMPLES, snr_db=20.0, trigger_jitter_rms=50e-9)
     verdicts = []
-    for seed in (1, 74, 126):
+    for seed in (1, 12):
         study = scene.simulate(seed=seed)
         driver = etid.identify_driver(study["c"], throw=False)
         fits = etid.identify_skins(study.loaded, driver)
-        assert (np.abs(off(fits.successful(), DAMP)) < SIGMAS).all()
+        assert (np.abs(off(fits.successful(), DRY)) < SIGMAS).all()
         verdicts += fits.verdicts.tolist()
     assert "driver_unclear" in verdicts
     assert "successful" in verdicts

@@ -20,7 +20,7 @@ from etid.estimators.starts import source_starts
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.results.driver import Calibration, ContinuousDriver, HarmonicDriver, SourceImpedance
 from etid.results.verdicts import RESULTS, first_verdict
-from etid.signals.knots import banded
+from etid.signals.knots import above_noise, banded
 from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational
 
@@ -48,7 +48,7 @@ def from_harmonics(
 
     The fits from all starts use bands of harmonics. The best is refined with all harmonics.
     """
-    spectra, rate = records.spectrum, jnp.asarray(records.sample_rate)[0]
+    spectra, rate = above_noise(records.spectrum), jnp.asarray(records.sample_rate)[0]
     baseline = iteration.periodic_driver_filter(spectra, r_load, rate, order)
     bands = banded(spectra)
 
