@@ -26,7 +26,7 @@ from etid.simulation.scenes import Scene, Trial, paper_calibration
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from etid.solvers.matrices import inverse_root
 from tests import kept_numbers
-from tests.skins import DAMP, DRY, off
+from tests.skins import DRY, off
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 

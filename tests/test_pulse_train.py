@@ -64,6 +64,20 @@ def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
         np.testing.assert_allclose(found, right[::-1], rtol=2 * PULSE / rate)
 
 
+@pytest.mark.parametrize("sample_rate", [100e3, 500e3])
+@pytest.mark.parametrize(
+    ("ppm", "snr_db", "refused"),
+    [(20.0, None, True), (-20.0, 60.0, True), (2.0, 60.0, False), (20.0, 20.0, False)],
+)
+def test_two_records_with_different_clocks_are_a_mismatch(sample_rate, ppm, snr_db, refused):
+    """20 ppm are 0.33 µs from one pulse to the next; R_s was 1.5 % wrong at 60 dB, seven σ."""
+    one, other = (simulate(sample_rate, 5.0, snr_db=snr_db, pulse_rate_ppm=of) for of in (0.0, ppm))
+    record = Inspected(one.replace(v_out=other.v_out))
+    assert preflight(record) == ("rate_mismatch" if refused else None)
+    if refused:
+        assert "their clocks differ by about 20 ppm" in explained(record, "rate_mismatch")
+
+
 def test_a_period_that_is_given_as_a_rate_is_named(noisy):
     wrong = Inspected(noisy.replace(pulse_rate=1 / PULSE))
     assert preflight(wrong, periodic=True) == "rate_mismatch"

@@ -23,7 +23,7 @@ from etid.identify import changes
 from etid.identify.fitting import FEWEST, Batch, Prepared, is_shared
 from etid.identify.options import Options, check_default, plan
 from etid.precision import in_float64
-from etid.recordings.causes import why_implausible, why_misaligned
+from etid.recordings.causes import why_implausible, why_misaligned, why_rates_differ
 from etid.recordings.preflight import Group, Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.feed import AbstractFeed
@@ -201,7 +201,7 @@ def explained(seen: Inspected, name: str) -> str:
     if seen.by_current is not None and name in EXPLAINED and preflight(seen) != name:
         seen = seen.by_current  # the fault is in the current
     if name == "rate_mismatch":
-        found = seen.train.mismatch
+        found = why_rates_differ(seen)
     elif name == "misaligned":
         found = why_misaligned(seen)
     elif name == "wrong_unit":

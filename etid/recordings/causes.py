@@ -40,6 +40,19 @@ def sizes(voltage: float, current: float) -> str:
     return f"v_out spans {voltage:.3g} V and current {current:.3g} A, {voltage / current:.3g} ohm."
 
 
+def why_rates_differ(inspected: Inspected) -> str:
+    """How the pulses contradict the rates, or those of one record those of the other."""
+    if not inspected.clocks_differ:
+        return inspected.train.mismatch
+    word = "farther" if inspected.apart > 0 else "less far"
+    between = inspected.spacing * (inspected.train.edges.size - 1)
+    ppm = float(f"{1e6 * abs(inspected.apart) / between:.1g}")  # the edges tell no more
+    return (
+        f"The last pulse of v_out is {abs(inspected.apart):.2g} samples {word} from the first than "
+        f"that of v_th: their clocks differ by about {ppm:g} ppm."
+    )
+
+
 def why_misaligned(inspected: Inspected) -> str:
     """The probable cause of the verdict `misaligned`, with numbers; empty if it is not known."""
     if inspected.shifts is not None and inspected.kept is None:

@@ -20,7 +20,7 @@ from etid.signals.disturbances import (
 from etid.signals.harmonics import filled, harmonics, whole_periods
 from etid.signals.mains import Hum, separated
 from etid.signals.noise import RIPPLE, VISIBLE, is_coarse, noise_std, shows_few, step_of
-from etid.signals.pulse_train import PulseTrain, lags_of, pulse_trains, rise_time
+from etid.signals.pulse_train import PulseTrain, clocks_apart, lags_of, pulse_trains, rise_time
 from etid.signals.quick_looks import flickering, humming, uneven
 
 _Key = TypeVar("_Key", bound=Hashable)
@@ -193,6 +193,12 @@ class Group:
     def trusted(self) -> Float[np.ndarray, "recording 2"]:
         """`noise` as far as estimators trust it: not below the error of the interpolation."""
         return np.maximum(self.noise, RIPPLE * np.ptp(self.limits, axis=-1))
+
+    @functools.cached_property
+    @quietly()
+    def apart(self) -> Float[np.ndarray, " recording"]:
+        """Drift of `v_out` against its cause from the first pulse to the last [samples]."""
+        return clocks_apart(self.quiet, self.noise, self.trains)
 
     @functools.cached_property
     @quietly()

@@ -17,7 +17,7 @@ from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, aliases, joins_aliases
 from etid.signals.mains import Hum
-from etid.signals.pulse_train import PulseTrain, rise_time, shifted, whole_lag
+from etid.signals.pulse_train import APART, PulseTrain, rise_time, shifted, whole_lag
 
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 
@@ -49,6 +49,7 @@ class Inspected:
     coarse: Float[np.ndarray, "2"] = _recorded("coarse")
     hum: list[Hum | None] = _recorded("hum")
     shifts: Shifts | None = _recorded("shifts")
+    apart: float = _recorded("apart")
     whole_periods: tuple[int, int] = _recorded("whole_periods")
     # From here on, of the periods in use, if some are left out or aligned.
     recorded: Float[np.ndarray, "2 time"] = _in_use("whole")
@@ -146,6 +147,13 @@ class Inspected:
     def is_flat(self) -> Bool[np.ndarray, "2"]:
         """Whether `v_th` and `v_out` carry no signal: eight standard deviations span them."""
         return (self.spans <= 8 * self.sigma) | (self.spans == 0)
+
+    @property
+    def clocks_differ(self) -> bool:
+        """Whether `v_out` drifts away from `v_th` from pulse to pulse, and lost no sample."""
+        if self.has_current or self.train.mismatch or self.shifts is not None:
+            return False
+        return bool(abs(self.apart) > APART)
 
     @property
     def remarks(self) -> Remark:
@@ -317,7 +325,7 @@ _VERDICTS: dict[str, Callable[[Inspected], bool]] = {
     "saturated": _is_saturated,
     "wrong_unit": _is_implausible,
     "unconnected": _is_unconnected,
-    "rate_mismatch": lambda of: of.train.mismatch != "",
+    "rate_mismatch": lambda of: of.train.mismatch != "" or of.clocks_differ,
     "misaligned": _is_misaligned,
     "not_periodic": lambda of: not of.is_periodic,
 }

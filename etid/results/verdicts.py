@@ -109,8 +109,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     rate_mismatch = (
         "The distance between the pulses of v_th or the current contradicts sample_rate and "
-        "pulse_rate. Every time constant would be wrong by the same factor. Correct the wrong "
-        "number."
+        "pulse_rate, or that between the pulses of v_out. Correct the wrong number, or record both "
+        "with one clock."
     )
     not_periodic = (
         "The record holds no whole pulse period, or begins in the middle of an edge. "
