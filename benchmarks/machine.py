@@ -71,6 +71,27 @@ def write_csv(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
     return None
 
 
+def read_csv(path: pathlib.Path) -> list[dict[str, Any]]:
+    """Rows of `write_csv`, with numbers as numbers; none if there is no file."""
+    if not path.exists():
+        return []
+    words = {*provenance()}  # a commit may look like a number
+    with path.open(newline="") as file:
+        return [
+            {name: text if name in words else _value(text) for name, text in row.items()}
+            for row in csv.DictReader(file)
+        ]
+
+
+def _value(text: str) -> Any:
+    if text in ("True", "False"):
+        return text == "True"
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return kind(text)
+    return text
+
+
 def pin() -> None:
     """One core for this process, before JAX counts them."""
     if hasattr(os, "sched_setaffinity"):

@@ -40,6 +40,14 @@ def clopper_pearson(events: float, trials: float) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def median_interval(values: np.ndarray) -> tuple[float, float]:
+    """The order statistics between which the median of the population lies, by the signs alone."""
+    below, above = scipy.stats.binom.interval(LEVEL, values.size, 0.5)  # values below the median
+    ranks = np.array([below - 1, above], int).clip(0, values.size - 1)
+    low, high = np.sort(values)[ranks]
+    return float(low), float(high)
+
+
 def rate(events: Sequence[bool] | np.ndarray, drivers: Iterable[int]) -> Rate:
     """Rate of events in trials, given the driver of each; NaN without trials."""
     happened = np.asarray(events, float)

@@ -21,8 +21,8 @@ import etid
 from benchmarks import rivals
 from benchmarks.estimators import DEFAULT, ELEMENTS, NOTHING, OURS, Answer, Drivers, method_of
 from benchmarks.ladder import CALIBRATION, SOURCES, START, TRIAL, ladder
-from benchmarks.machine import make_room, timed, write_csv
-from benchmarks.rates import LEVEL
+from benchmarks.machine import make_room, read_csv, timed, write_csv
+from benchmarks.rates import LEVEL, median_interval
 from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report, show
 from benchmarks.speed_accuracy_chart import chart
 from etid.simulation.scenes import Scene
@@ -50,7 +50,12 @@ WORSE = ("steiglitz_mcbride", "equation_error")  # their errors must be larger t
 OPTIONS = (
     QUICK,
     FOLDER,
-    option("--scene", action="append", choices=list(ladder()), help="repeatable"),
+    option(
+        "--scene",
+        action="append",
+        choices=list(ladder()),
+        help="repeatable; the table keeps its others",
+    ),
     option("--source", default="simulated", choices=SOURCES),
     option("--repetitions", default=200),
 )
@@ -115,14 +120,6 @@ class Result(NamedTuple):
             "wrong": float(np.mean(answered & [of.wrong for of in self.answers])),
             "silent": float(np.mean(answered & [of.silent for of in self.answers])),
         }
-
-
-def median_interval(values: np.ndarray) -> tuple[float, float]:
-    """The order statistics between which the median of the population lies, by the signs alone."""
-    below, above = scipy.stats.binom.interval(LEVEL, values.size, 0.5)  # values below the median
-    ranks = np.array([below - 1, above], int).clip(0, values.size - 1)
-    low, high = np.sort(values)[ranks]
-    return float(low), float(high)
 
 
 def ours(draws: Draws, drivers: Drivers, name: str) -> Iterator[Result]:
@@ -276,12 +273,14 @@ def main(arguments: argparse.Namespace) -> bool:
     """Print and write the table and the charts; whether the ranking of methods holds."""
     quick, folder = arguments.quick, arguments.folder
     repetitions = FEW_REPETITIONS if quick else arguments.repetitions
-    table: list[dict[str, Any]] = []
-    for name in tqdm(arguments.scene or list(FEW if quick else ladder()), unit="scene"):
+    scenes, order = arguments.scene or list(FEW if quick else ladder()), list(ladder())
+    before = read_csv(folder / FILE) if arguments.scene else []
+    table = [row for row in before if row["scene"] not in scenes]
+    for name in tqdm(scenes, unit="scene"):
         rows = rows_of(name, arguments.source, repetitions, quick)
         for row in rows:
             show(row, *PRINTED)
-        table += rows
+        table = sorted([*table, *rows], key=lambda row: order.index(row["scene"]))
         write_csv(folder / FILE, table)  # each scene is kept as it comes
         make_room()
     chart(table, folder / "speed_accuracy_all.svg")

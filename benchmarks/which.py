@@ -1,7 +1,6 @@
 """Which estimator when: a table of the benchmarks' README, from results of `speed_accuracy`."""
 
 import argparse
-import csv
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.estimators import OURS
-from benchmarks.machine import RESULTS, ROOT
+from benchmarks.machine import RESULTS, ROOT, read_csv
 from benchmarks.runner import option
 from benchmarks.speed_accuracy import FILE
 from etid.estimators.registry import names
@@ -28,11 +27,8 @@ Row = Mapping[str, Any]
 
 
 def read(path: pathlib.Path) -> list[dict[str, Any]]:
-    """Rows of our estimators, with numbers as numbers."""
-    with path.open() as file:
-        rows = [row for row in csv.DictReader(file) if row["mode"] != "rival"]
-    numbers = ("draws", "error", "error_low", "error_high", "none", "said", "silent", "ms")
-    return [{**row, **{name: float(row[name]) for name in numbers}} for row in rows]
+    """Rows of our estimators."""
+    return [row for row in read_csv(path) if row["mode"] != "rival"]
 
 
 def table(rows: Sequence[Row]) -> str:

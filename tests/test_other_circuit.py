@@ -128,7 +128,7 @@ def test_a_relaxation_that_the_circuit_has_is_none():
 
 def identified(load, snr_db, circuit):
     scene = dataclasses.replace(rung("dry", snr_db=snr_db), trials=(Trial("skin", load),))
-    study = scene.simulate(11)
+    study = scene.simulate(12)
     driver = etid.identify_driver(study[CALIBRATION])
     return etid.identify_skin(study["skin"], driver, circuit=circuit, throw=False)
 
