@@ -74,6 +74,9 @@ _BOTH = (
 class MaximumLikelihood(AbstractEstimator):
     """Maximum likelihood with noise on both records, on the harmonics of whole pulse periods.
 
+    A driver is fitted to the bands of harmonics in which the pulse exceeds its noise
+    (`etid.signals.knots.above_noise`), a load to all of them.
+
     Attributes:
         known_elements: Elements that are known: name, value and standard deviation [SI]; 0 fixes
             one.
