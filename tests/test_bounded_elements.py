@@ -179,6 +179,19 @@ def test_a_profile_ends_at_an_upper_bound(noisy, free):
     assert ended.interval()[1] == bound
 
 
+@pytest.mark.slow
+def test_profiles_of_other_elements_keep_to_an_upper_bound(noisy, free):
+    """R_s may not be above its bound, so R_p, which has its sum with R_s, may hardly be below."""
+    bound = above(free, -1.0)
+    profile = etid.identify_skin(noisy, bounds={"r_s": (None, bound)}).profile("r_p")
+    cov = np.asarray(free.cov)
+    middle = float(free.circuit.r_p) + cov[0, 1] / cov[0, 0] * (bound - float(free.circuit.r_s))
+    error = np.sqrt(cov[1, 1] - cov[0, 1] ** 2 / cov[0, 0])
+    # That of a normal distribution of R_p at the bound of R_s, up to the skew at 20 dB.
+    low = profile.interval()[0]
+    np.testing.assert_allclose(low, middle - 1.96 * error, rtol=0, atol=0.4 * error)
+
+
 def test_a_choice_compares_each_circuit_inside_its_own_bounds(noisy, free):
     """R_p of the true circuit is forbidden; another circuit has no such element."""
     candidates = [etid.SkinRC(), etid.Resistor()]
