@@ -11,7 +11,6 @@ Z = 33.4e3 + 186e3 / (1 + 2j * np.pi * F * 186e3 * 0.12e-9)
 
 
 def test_a_table_of_impedances_is_read_and_fitted(tmp_path):
-    pytest.importorskip("impedance")
     np.savetxt(tmp_path / "z.csv", np.stack([F, np.real(Z), np.imag(Z)], axis=1), delimiter=",")
     frequency, impedance = etid.read_impedance(tmp_path / "z.csv")
     np.testing.assert_allclose(frequency, F)

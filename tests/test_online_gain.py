@@ -6,9 +6,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import etid
 from benchmarks.online_alarms import LOADS, Fingertip
+from etid.online.tracker import Tracker
 from etid.results.verdicts import verdict_names
-from tests.test_online import TEN, after_amplitude, followed, ten, with_noise
+from tests.test_online import (
+    NOISE,
+    TEN,
+    after_amplitude,
+    followed,
+    loaded,
+    quiet,
+    scene,
+    ten,
+    with_noise,
+)
 
 SOON = 2  # pulses after which 1 % must be refused at 60 dB
 
@@ -31,6 +43,30 @@ def test_one_per_cent_of_gain_or_amplitude_is_refused_within_two_pulses(factor, 
     pulses = with_noise((1.0 if told else factor) * clean, seed=3)
     found, _ = verdicts_of_pulses(tracker, pulses, amplitude)
     assert (found[SOON - 1 :] != "successful").all()
+
+
+@pytest.fixture(scope="module")
+def at_40_db():
+    """A tracker of ten electrodes whose calibration has 40 dB, and 24 pulses without noise."""
+    study = scene(12, snr_db=40.0, trigger_jitter_rms=50e-9).simulate(seed=0)
+    driver = etid.identify_driver(list(study.calibrations.recordings()))
+    tracker = Tracker.of(driver, study["cal/0"], electrodes=TEN)
+    clean = np.tile(tracker.pulses(loaded(quiet())), (1, TEN // 2, 1))
+    return tracker, np.concatenate([clean] * 2)
+
+
+@pytest.mark.parametrize(
+    ("factor", "skin", "half"), [(0.99, "dry", 3), (0.995, "dry", 20), (0.98, "damp", 7)]
+)
+def test_gains_at_40_db_are_refused_by_half_of_the_electrodes_about_as_soon_as_said(
+    at_40_db, factor, skin, half
+):
+    """The guide has the medians of three drivers; that of five electrodes scatters by a third."""
+    tracker, pulses = at_40_db
+    noise = 10 * NOISE * np.random.default_rng(3).standard_normal(pulses.shape)
+    found, _ = verdicts_of_pulses(tracker, factor * pulses + noise)
+    refused = found[half - 1 :, ("dry", "damp").index(skin) :: 2] != "successful"
+    assert refused.all(axis=0).mean() > 0.5
 
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])
