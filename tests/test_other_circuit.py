@@ -1,6 +1,7 @@
 """Score tests against other circuits: the changes, their statistics, what they see in records."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -146,6 +147,9 @@ def test_another_skin_is_a_misfit_where_chi2_does_not_show_it(load, snr_db, circ
     fit = identified(load, snr_db, circuit)
     assert fit.chi2 < most
     assert fit.verdict == "misfit"
+    found = re.search(r"The residual looks like (a|another) .* \((\d+) standard dev", fit.note)
+    assert found is not None
+    assert int(found[2]) >= 5
 
 
 @pytest.mark.parametrize(
@@ -171,7 +175,7 @@ def test_a_wrong_gain_is_seen_where_it_moves_r_p_by_a_quarter():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("snr_db", [40.0, 50.0])
+@pytest.mark.parametrize("snr_db", [40.0, 50.0, 60.0])
 def test_good_recordings_are_refused_as_rarely_as_a_study_can_bear(snr_db):
     """Of 2000 with drawn drivers; six tests of 1 in 10 000 refuse 1.2 of them.
 
