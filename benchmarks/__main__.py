@@ -12,7 +12,7 @@ from benchmarks.ngspice import NgspiceError
 from benchmarks.rivals import RivalError
 
 NAMES = (
-    *("spice", "coverage", "driver_order", "delays", "noise", "selection", "design"),
+    *("spice", "coverage", "driver_order", "delays", "noise", "tolerances", "selection", "design"),
     *("speed", "curves", "scale", "amplitudes", "amplitude_errors", "online", "control"),
     *("speed_accuracy", "which", "paper", "failure_map", "perturbations", "spectra", "rivals"),
     *("referee", "fuzz", "mutation", "live"),

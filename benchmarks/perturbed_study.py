@@ -136,14 +136,14 @@ def parts(*voltages: str, **factors: float) -> Callable[[Record], Record]:
     return change
 
 
-def crosstalk(later: float) -> Callable[[Record], Record]:
-    """Let the loaded voltage see 1 % of an unloaded one whose pulse is later by so much [s]."""
+def crosstalk(later: float, part: float = 0.01) -> Callable[[Record], Record]:
+    """Let the loaded voltage see a part of an unloaded one whose pulse is later by so much [s]."""
 
     def change(of: Record) -> Record:
         other = dataclasses.replace(of.th, delay=of.th.delay - later)
 
         def seen(time: Float[np.ndarray, " time"], rng: np.random.Generator):
-            return 0.01 * other.volts(of.sample_rate, time.size, rng)
+            return part * other.volts(of.sample_rate, time.size, rng)
 
         return out(added=(seen,))(of)
 

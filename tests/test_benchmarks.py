@@ -67,6 +67,9 @@ CASES = {
         "selection.csv selection_map.csv selection.svg", "spurious element, from 20 dB",
     ),
     "spectra": ("--spectra 4 --good 6 --seed 1", "", "wrong sign"),
+    "tolerances": (
+        "--draws 2 --snr-db 60 --only gain --workers 1", "", "60 dB, gain, joint, damp: covered",
+    ),
     "which": ("--readme {}/README.md", "README.md", "| dry, 60 dB | **0.8"),
 }  # fmt: skip
 QUICK = ("rivals", "referee", "which")

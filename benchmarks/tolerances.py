@@ -1,0 +1,79 @@
+"""Are intervals honest when an instrument has the errors that its tolerances allow?
+
+Each study of `benchmarks.perturbed_study.undisturbed` gets errors that are drawn from the stated
+tolerances, one kind at a time or all of them, in its calibration and in dry and damp skin. Printed
+is the coverage (with the targets of `benchmarks.coverage`) of fits behind a driver and of joint
+fits.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+import etid
+from benchmarks import perturbed_study as lab
+from benchmarks.coverage import JOINT, Draws, draw, targets
+from benchmarks.ladder import LOADS
+from benchmarks.runner import WORKERS, Target, each, option, report
+
+TRUTH = {path: dataclasses.astuple(skin) for path, skin in LOADS.items()}
+FIRST = 5000  # number of the first driver
+SIZES = {"gain": 2e-3, "r_load": 2e-3, "crosstalk": 2e-3, "capacitance": 2e-12}  # [relative, F]
+KINDS = {**{name: (name,) for name in SIZES}, "all": tuple(SIZES)}
+MODES = ("behind a driver", JOINT)
+
+OPTIONS = (
+    WORKERS,
+    option("--snr-db", default=(40.0, 60.0)),
+    option("--draws", default=200),
+    option("--only", nargs="+", choices=KINDS, help="kinds of errors"),
+    option("--mode", nargs="+", choices=MODES, default=MODES),
+)
+
+
+def study(number: int, snr_db: float, names: Sequence[str]) -> etid.Study:
+    """A calibration and two skins, by an instrument whose errors of these kinds are drawn."""
+    rng = np.random.default_rng([number, *b"errors"])
+    drawn = {name: size * float(rng.standard_normal()) for name, size in SIZES.items()}
+    error = {name: of if name in names else 0.0 for name, of in drawn.items()}
+    of = lab.undisturbed(number, snr_db)
+    of = lab.all_records(lab.out(gain=1 + error["gain"]))(of)
+    of = lab.all_records(lab.crosstalk(0.0, error["crosstalk"]))(of)
+    of = lab.trials(lab.shunted(error["capacitance"]))(of)
+    of = lab.calibrations(lab.record(r_load=lab.REFERENCE / (1 + error["r_load"])))(of)
+    records = [one.recording(number) for one in (*of.calibrations, *of.trials)]
+    return etid.Study.from_recordings(records)
+
+
+def fits_of(of: etid.Study, mode: str, instrument: etid.Instrument) -> Mapping[str, etid.Fit]:
+    """Fits of both skins by path; none if the driver failed."""
+    if mode == JOINT:
+        fits = etid.identify_jointly(of, instrument=instrument).fits
+        return {path: fits[i] for i, path in enumerate(fits.labels["path"])}
+    known = list(of.calibrations.recordings())
+    driver = etid.identify_driver(known, instrument=instrument, throw=False)
+    if driver.verdict != "successful":
+        return {}
+    return {path: etid.identify_skin(of[path], driver, throw=False) for path in TRUTH}
+
+
+def answers(number: int, snr_db: float, kind: str, mode: str) -> list[tuple]:
+    """A row of `Draws` for each skin."""
+    instrument = etid.Instrument(**{name: SIZES[name] for name in KINDS[kind]})
+    fits = fits_of(study(number, snr_db, KINDS[kind]), mode, instrument)
+    return [draw(fits.get(path), true) for path, true in TRUTH.items()]
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    asked: list[Target] = []
+    for snr_db in arguments.snr_db:
+        for kind in arguments.only or KINDS:
+            for mode in arguments.mode:
+                numbers = range(FIRST, FIRST + arguments.draws)
+                tasks = [(number, snr_db, kind, mode) for number in numbers]
+                found = dict(each(answers, tasks, arguments.workers, "draw", "tolerances"))
+                for path, rows in zip(TRUTH, zip(*found.values(), strict=True), strict=True):
+                    asked += targets(f"{snr_db:g} dB, {kind}, {mode}, {path}", Draws.of(rows))
+    return report(asked)
