@@ -12,6 +12,7 @@ import functools
 import math
 from collections.abc import Mapping
 
+import numpy as np
 import scipy.stats
 
 from benchmarks import perturbed_study as lab
@@ -188,15 +189,24 @@ CALIBRATIONS: Mapping[str, Change] = {
     "calibration_is_skin": calibrations(out(loads=(LOADS["dry"],))),
 }
 
+FAULTS = (NUISANCES, CONVERTERS, CLOCKS, SKINS, DRIVERS, CALIBRATIONS)
 PERTURBATIONS: Mapping[str, Change] = {
-    **UNDISTURBED,
-    **NUISANCES,
-    **CONVERTERS,
-    **CLOCKS,
-    **SKINS,
-    **DRIVERS,
-    **CALIBRATIONS,
+    name: change for group in (UNDISTURBED, *FAULTS) for name, change in group.items()
 }
+AND = " + "
+
+
+def pair(number: int) -> str:
+    """Two faults of different groups, drawn at random."""
+    rng = np.random.default_rng([number, *b"pair"])
+    groups = rng.choice(len(FAULTS), 2, replace=False)
+    return AND.join(str(rng.choice(list(FAULTS[group]))) for group in groups)
+
+
+def change_of(name: str) -> Change:
+    """The change that a perturbation is, or a pair of them, one after the other."""
+    changes = [PERTURBATIONS[one] for one in name.split(AND)]
+    return lambda study: functools.reduce(lambda of, change: change(of), changes, study)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,6 +12,7 @@ in the recording, any of them will do. A method without standard errors is held 
 import argparse
 import collections
 import functools
+import itertools
 import math
 import pathlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -24,13 +25,14 @@ from benchmarks import charts, estimators
 from benchmarks.estimators import DEFAULT, ELEMENTS, FAR, Answer, Drivers, fits, found_by
 from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS, recorded
-from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
+from benchmarks.perturbation_list import AND, INVISIBLE, PERTURBATIONS, UNDISTURBED, change_of, pair
 from benchmarks.perturbed_study import Truth, undisturbed
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, show, tabled
 
 TARGETS = {
     "silent": at_most(0),  # but for what no test can see
     "undisturbed recordings refused": at_most(0.02),
+    "silent pairs of faults that are seen alone": at_most(0),
 }
 KINDS = tuple(charts.ANSWERS)
 FEW = ("base", "polarity_out", "rp_linear_0.2", "driver_Rload_wrong_5%")
@@ -42,6 +44,7 @@ OPTIONS = (
     option("--only", nargs="+", choices=PERTURBATIONS, metavar="NAME", help="these perturbations"),
     option("--drivers", default=10),
     option("--snr-db", default=(40.0, 60.0), metavar="DB"),
+    option("--pairs", default=0, help="so many pairs of faults, drawn at random, in their place"),
 )
 
 
@@ -92,7 +95,7 @@ def answers_of(names: Sequence[str], number: int, snr_db: float) -> list[Answer]
     drivers, found = Drivers(), list[Answer]()
     together: dict[int, tuple[etid.Driver | None, list[tuple[str, Record, Truth]]]] = {}
     for name in names:
-        study = PERTURBATIONS[name](undisturbed(number, snr_db))
+        study = change_of(name)(undisturbed(number, snr_db))
         driver = drivers.of([of.recording(number) for of in study.calibrations], DEFAULT)
         _, trials = together.setdefault(id(driver), (driver, []))
         trials += [(name, of, study.truths[of.path]) for of in study.trials]
@@ -144,7 +147,7 @@ def _worst(silent: Sequence[Answer]) -> dict[str, Any]:
 
 def targets(answers: Sequence[Answer]) -> Iterator[Target]:
     """What the default method misses."""
-    silent, refused = TARGETS
+    silent, refused, _ = TARGETS
     for row in table(answers, ("perturbation", "snr_db", "path")):
         name, place, count = row["perturbation"], (row["path"], row["snr_db"]), row[silent]
         known = INVISIBLE.get(name)
@@ -174,7 +177,31 @@ def _label(name: str) -> str:
     return f"{name} (invisible{'' if math.isinf(snr) else f' up to {snr:g} dB'})"
 
 
+def pairs(arguments: argparse.Namespace) -> bool:
+    """Two faults at once, each pair behind a driver of its own."""
+    levels = itertools.cycle(arguments.snr_db)
+    tasks = [([pair(number)], number, next(levels)) for number in range(arguments.pairs)]
+
+    def rows(done: Mapping[int, Sequence[Answer]]) -> list[dict[str, Any]]:
+        every = [answer for found in done.values() for answer in found]
+        return table(every, ("perturbation", "snr_db", "path"))
+
+    path, settings = arguments.folder / "perturbation_pairs.csv", {"keep": "perturbation_pairs"}
+    found = tabled(path, rows, answers_of, tasks, workers=arguments.workers, **settings)
+    every = [answer for of in found for answer in of]
+    silent = [answer for answer in every if kind(answer) == "silent"]
+    alone = [of for of in silent if INVISIBLE.keys().isdisjoint(of.perturbation.split(AND))]
+    counts = collections.Counter(map(kind, every))
+    print(f"{arguments.pairs} pairs: {', '.join(f'{counts[name]} {name}' for name in KINDS)}")
+    for of in silent:
+        far = f"{np.nanmax(in_stderrs(of)):.1f} standard errors"
+        print(f"silent: {of.perturbation}, {of.path} at {of.snr_db:g} dB, seed {of.seed}: {far}")
+    return report([Target.of(TARGETS, [*TARGETS][-1], float(len(alone)))])
+
+
 def main(arguments: argparse.Namespace) -> bool:
+    if arguments.pairs:
+        return pairs(arguments)
     quick, folder = arguments.quick, arguments.folder
     names = list(FEW) if quick else arguments.only or list(PERTURBATIONS)
     numbers = range(2 if quick else arguments.drivers)

@@ -14,7 +14,15 @@ from benchmarks.laboratory import SCALE
 from benchmarks.ladder import LOADS
 from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
 from benchmarks.machine import RESULTS
-from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
+from benchmarks.perturbation_list import (
+    AND,
+    FAULTS,
+    INVISIBLE,
+    PERTURBATIONS,
+    UNDISTURBED,
+    change_of,
+    pair,
+)
 from benchmarks.perturbed_study import undisturbed
 from benchmarks.rates import clopper_pearson, rate
 from benchmarks.runner import report
@@ -42,6 +50,14 @@ def answer(error: Any = 0.0, verdict="successful", stderr: Any = 0.01, bound: An
     place: dict[str, Any] = {"perturbation": "base", "snr_db": 60.0, "seed": 0, **more}
     return Answer("default", path=place.pop("path", "dry"), verdict=verdict,
                   **dict(zip(("error", "stderr", "bound"), of, strict=True)), **place)  # fmt: skip
+
+
+def test_a_pair_of_faults_is_both_of_them():
+    names = pair(3).split(AND)
+    groups = [next(i for i, group in enumerate(FAULTS) if name in group) for name in names]
+    assert len(set(groups)) == 2
+    study = change_of(AND.join(("says_50Hz", "gain_out_+1%_all")))(undisturbed(0, 60.0))
+    assert all(of.told == {"pulse_rate": 50.0} and of.out.gain == 1.01 for of in study.trials)
 
 
 FAR = (0.06, 0, 0)
