@@ -26,7 +26,7 @@ from benchmarks.estimators import DEFAULT, ELEMENTS, FAR, Answer, Drivers, fits,
 from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS, recorded
 from benchmarks.perturbation_list import AND, INVISIBLE, PERTURBATIONS, UNDISTURBED, change_of, pair
-from benchmarks.perturbed_study import Truth, undisturbed
+from benchmarks.perturbed_study import PARTS, Truth, undisturbed
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, show, tabled
 
 TARGETS = {
@@ -44,6 +44,7 @@ OPTIONS = (
     option("--only", nargs="+", choices=PERTURBATIONS, metavar="NAME", help="these perturbations"),
     option("--drivers", default=10),
     option("--snr-db", default=(40.0, 60.0), metavar="DB"),
+    option("--parts", default=PARTS, help="spread of the parts of the drivers"),
     option("--pairs", default=0, help="so many pairs of faults, drawn at random, in their place"),
 )
 
@@ -90,12 +91,14 @@ def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[s
     return {path: np.array(list(of.relative.values())) for path, of in etid.bound(scene).items()}
 
 
-def answers_of(names: Sequence[str], number: int, snr_db: float) -> list[Answer]:
+def answers_of(
+    names: Sequence[str], number: int, snr_db: float, parts: float = PARTS
+) -> list[Answer]:
     """All answers behind one driver with one noise; perturbations that share a driver together."""
     drivers, found = Drivers(), list[Answer]()
     together: dict[int, tuple[etid.Driver | None, list[tuple[str, Record, Truth]]]] = {}
     for name in names:
-        study = change_of(name)(undisturbed(number, snr_db))
+        study = change_of(name)(undisturbed(number, snr_db, parts))
         driver = drivers.of([of.recording(number) for of in study.calibrations], DEFAULT)
         _, trials = together.setdefault(id(driver), (driver, []))
         trials += [(name, of, study.truths[of.path]) for of in study.trials]
@@ -180,7 +183,8 @@ def _label(name: str) -> str:
 def pairs(arguments: argparse.Namespace) -> bool:
     """Two faults at once, each pair behind a driver of its own."""
     levels = itertools.cycle(arguments.snr_db)
-    tasks = [([pair(number)], number, next(levels)) for number in range(arguments.pairs)]
+    parts, numbers = arguments.parts, range(arguments.pairs)
+    tasks = [([pair(number)], number, next(levels), parts) for number in numbers]
 
     def rows(done: Mapping[int, Sequence[Answer]]) -> list[dict[str, Any]]:
         every = [answer for found in done.values() for answer in found]
@@ -205,7 +209,8 @@ def main(arguments: argparse.Namespace) -> bool:
     quick, folder = arguments.quick, arguments.folder
     names = list(FEW) if quick else arguments.only or list(PERTURBATIONS)
     numbers = range(2 if quick else arguments.drivers)
-    tasks = [(names, number, snr) for number in numbers for snr in arguments.snr_db]
+    parts, levels = arguments.parts, arguments.snr_db
+    tasks = [(names, number, snr, parts) for number in numbers for snr in levels]
 
     def ordered(done: Iterable[Sequence[Answer]]) -> list[Answer]:
         every = (answer for found in done for answer in found)

@@ -65,12 +65,12 @@ def drawn_driver(number: int, spread: float, usual: TransformerDriver) -> Transf
     return dataclasses.replace(usual, **parts)
 
 
-def undisturbed(number: int, snr_db: float) -> Study:
+def undisturbed(number: int, snr_db: float, parts: float = PARTS) -> Study:
     """The study of one driver: dry and damp skin, 98.8 kΩ, three periods at 200 kHz.
 
-    Its parts differ by 3 % from those of `TransformerDriver`.
+    Its parts differ by so much from those of `TransformerDriver`.
     """
-    driver = drawn_driver(number, PARTS, TransformerDriver())
+    driver = drawn_driver(number, parts, TransformerDriver())
     rng = np.random.default_rng([number, *b"delays"])
     sigma = noise(driver, 200e3, snr_db)
 
