@@ -67,7 +67,13 @@ def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
 @pytest.mark.parametrize("sample_rate", [100e3, 500e3])
 @pytest.mark.parametrize(
     ("ppm", "snr_db", "refused"),
-    [(20.0, None, True), (-20.0, 60.0, True), (2.0, 60.0, False), (20.0, 20.0, False)],
+    [
+        (20.0, None, True),
+        (-20.0, 60.0, True),
+        (300.0, 40.0, True),  # a sample and more, as if some were lost
+        (5.0, 60.0, False),
+        (20.0, 20.0, False),
+    ],
 )
 def test_two_records_with_different_clocks_are_a_mismatch(sample_rate, ppm, snr_db, refused):
     """20 ppm are 0.33 µs from one pulse to the next; R_s was 1.5 % wrong at 60 dB, seven σ."""
@@ -75,7 +81,23 @@ def test_two_records_with_different_clocks_are_a_mismatch(sample_rate, ppm, snr_
     record = Inspected(one.replace(v_out=other.v_out))
     assert preflight(record) == ("rate_mismatch" if refused else None)
     if refused:
-        assert "their clocks differ by about 20 ppm" in explained(record, "rate_mismatch")
+        said = f"their clocks differ by about {abs(ppm):g} ppm"
+        assert said in explained(record, "rate_mismatch")
+
+
+@pytest.mark.parametrize("sample_rate", [20e3, 50e3, 100e3, 200e3, 1e6])
+@pytest.mark.parametrize("before", [10e-6, 20e-6, 40e-6, 60e-6])
+def test_a_record_that_begins_close_to_an_edge_has_one_clock(sample_rate, before):
+    record = simulate(sample_rate, snr_db=60.0, start=1.2e-4 - before)
+    assert preflight(Inspected(record)) is None
+
+
+def test_a_disturbed_period_is_no_drift():
+    record = simulate(snr_db=60.0)
+    for period in (slice(3334), slice(6667, None)):
+        v_out = record.v_out.copy()
+        v_out[period] *= 0.5
+        assert not Inspected(record.replace(v_out=v_out)).clocks_differ
 
 
 def test_a_period_that_is_given_as_a_rate_is_named(noisy):

@@ -46,7 +46,8 @@ def from_harmonics(
 ) -> HarmonicDriver:
     """Refine Z_th by maximum likelihood.
 
-    The fits from all starts use bands of harmonics. The best is refined with all harmonics.
+    The fits from all starts use bands of harmonics. The best is refined with all harmonics of the
+    bands in which V_th exceeds its noise.
     """
     spectra, rate = above_noise(records.spectrum), jnp.asarray(records.sample_rate)[0]
     baseline = iteration.periodic_driver_filter(spectra, r_load, rate, order)

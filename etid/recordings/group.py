@@ -198,7 +198,7 @@ class Group:
     @quietly()
     def apart(self) -> Float[np.ndarray, " recording"]:
         """Drift of `v_out` against its cause from the first pulse to the last [samples]."""
-        return clocks_apart(self.quiet, self.noise, self.trains)
+        return clocks_apart(self.quiet, self.noise, self.trains, self.lags)
 
     @functools.cached_property
     @quietly()

@@ -17,7 +17,7 @@ from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, aliases, joins_aliases
 from etid.signals.mains import Hum
-from etid.signals.pulse_train import APART, PulseTrain, rise_time, shifted, whole_lag
+from etid.signals.pulse_train import PulseTrain, largest_drift, rise_time, shifted, whole_lag
 
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 
@@ -150,10 +150,10 @@ class Inspected:
 
     @property
     def clocks_differ(self) -> bool:
-        """Whether `v_out` drifts away from `v_th` from pulse to pulse, and lost no sample."""
-        if self.has_current or self.train.mismatch or self.shifts is not None:
+        """Whether `v_out` drifts away from `v_th` from pulse to pulse."""
+        if self.has_current or self.train.mismatch:
             return False
-        return bool(abs(self.apart) > APART)
+        return bool(abs(self.apart) > largest_drift(self.recording.sample_rate))
 
     @property
     def remarks(self) -> Remark:

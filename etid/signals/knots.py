@@ -144,8 +144,10 @@ def _size_and_signal(spectrum: Spectrum) -> tuple[Array, Array, Array]:
 def above_noise(spectrum: Spectrum) -> Spectrum:
     """The harmonics of each recording, selected in the bands in which X exceeds its noise.
 
-    The others say nearly nothing of Y/X. But a driver has ten parameters, and some Z_th agrees with
-    their noise so well that a fit leaves the minimum which the other harmonics have.
+    The others say little of Y/X. But a driver has ten parameters, and some Z_th agrees with their
+    noise so well that a fit leaves the minimum which the other harmonics have, for one that is
+    silently wrong: of 200 calibrations at 30 dB in two. At 20 dB, where half of the harmonics are
+    left out, C_p of dry skin scatters by a sixth more.
     """
     present = _size_and_signal(spectrum)[2][..., _bands(spectrum.frequency.shape[-1])]
     return dataclasses.replace(spectrum, selected=spectrum.selected & present)

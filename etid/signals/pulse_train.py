@@ -14,8 +14,12 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 EVEN = 0.05  # relative range of the spacings up to which the pulses have one rate
-APART = 0.1  # [samples] by which two records may drift apart from the first pulse to the last
-SURE = 5.0  # [standard errors] of that drift must be smaller than it
+# Drift of V_out against V_th from the first pulse to the last, above which clocks differ; of both,
+# the larger counts. 0.33 µs from one pulse to the next make R_s of dry skin 1.5 % wrong. Aliases of
+# edges that are shorter than a sample look like 0.05 samples.
+DRIFT, DRIFT_SAMPLES = 0.5e-6, 0.1  # [s], [samples]
+SURE = 5.0  # that drift must have so many standard errors, or noise hides it
+STEADY = 0.25  # part of the drift by which a pulse in the middle may be off its place
 TINY = 1e-300  # replaces the power of an edge of zeros
 RATE = 2e-3  # relative error of pulse_rate; a larger one is a wrong number, not an inexact clock
 
@@ -132,12 +136,9 @@ def pulse_trains(
         gaps = np.diff(edges)
         even = gaps.size > 0 and np.ptp(gaps) <= EVEN * gaps.mean()
         several = rows[same]
-        if even:
-            apart = _edges_apart(records, several, edges, step, sample_rate)[0]
-            spacings = (apart / (edges.size - 1)).tolist()
-        else:
-            spacings = [None] * several.size
-        for spacing, row in zip(spacings, several, strict=True):
+        spacings = _spacings(records, several, edges, step, sample_rate) if even else None
+        for number, row in enumerate(several):
+            spacing = None if spacings is None else float(spacings[number])
             trains[row] = PulseTrain(edges, spacing, size, sample_rate, pulse_rate)
     return trains
 
@@ -160,18 +161,14 @@ def _edges_of(above: Bool[np.ndarray, " place"], period: float) -> Int[np.ndarra
     return begins if begins.size >= ends.size else ends
 
 
-def _edges_apart(
+def _spacings(
     records: Float[np.ndarray, "record time"],
-    rows: Sequence[int] | Int[np.ndarray, " row"],
+    rows: Int[np.ndarray, " row"],
     edges: Int[np.ndarray, " pulse"],
     step: int,
     sample_rate: float,
-) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
-    """Distance of the first and the last edge of some records [samples].
-
-    The second result is its standard error per standard deviation of a sample's noise. It is
-    infinite if the last edge is at the end of the record: the distance is one of coarse edges then.
-    """
+) -> Float[np.ndarray, " row"]:
+    """Spacing of the pulses of some records [samples], from the first and the last edge."""
     first, last, size = int(edges[0]), int(edges[-1]), records.shape[1]
     off = 2 * step + 2  # [samples] error of the coarse edges
     rise = rise_time(sample_rate)
@@ -182,66 +179,15 @@ def _edges_apart(
     template = rises(records[rows, first - before : first + after + rise], rise)
     start = max(0, last - before - off)
     where = rises(records[rows, start : last + after + off + rise], rise)
-    if where.shape[1] < template.shape[1]:
-        return np.full(len(rows), float(last - first)), np.full(len(rows), np.inf)
+    between = edges.size - 1
+    if where.shape[1] < template.shape[1]:  # the last edge is at the end of the record
+        return np.full(rows.size, (last - first) / between)
     # Least squares of the difference. The correlation alone is biased towards the steepest part of
     # a slow edge.
     parts = np.lib.stride_tricks.sliding_window_view(where, template.shape[1], axis=1)
     power = np.einsum("rls,rls->rl", parts, parts)
-    top = np.argmax(np.einsum("rls,rs->rl", parts, template) - power / 2, axis=1)
-    lag, error = _within_a_sample(template, parts[np.arange(len(rows)), top], rise)
-    return start + top + lag - (first - before), error
-
-
-def _within_a_sample(
-    one: Float[np.ndarray, "record time"], other: Float[np.ndarray, "record time"], rise: int
-) -> tuple[Float[np.ndarray, " record"], Float[np.ndarray, " record"]]:
-    """Lag of the other of two records that differ by less than a sample, by least squares.
-
-    Aliases of a steep edge would move it by a tenth of a sample, so that only frequencies below a
-    quarter of the sample rate count. The second result is the lag's standard error if both records
-    are rises of records with white noise of standard deviation 1.
-    """
-    count = 1 + one.shape[1] // 4
-    turn = 2j * np.pi * np.fft.rfftfreq(one.shape[1])[:count]
-    aim, turned = (np.fft.rfft(of)[:, :count] for of in (one, other))
-    power = np.square(np.abs(turn * turned))
-    total = np.maximum(power.sum(1), TINY)
-    lag = np.zeros(len(one))
-    for _ in range(3):  # of half a sample, the third step is below 1e-4 samples
-        moved = turned * np.exp(turn * lag[:, None])
-        step = (np.conj(turn * moved) * (aim - moved)).real.sum(1) / total
-        lag = np.clip(lag + step, -1.0, 1.0)
-    noise = one.shape[1] * np.square(np.abs(np.exp(turn * rise) - 1))
-    return lag, np.sqrt((power * noise).sum(1)) / total
-
-
-def clocks_apart(
-    records: Float[np.ndarray, "recording 2 time"],
-    sigma: Float[np.ndarray, "recording 2"],
-    trains: Sequence[PulseTrain],
-) -> Float[np.ndarray, " recording"]:
-    """How much farther the last pulse is from the first in `v_out` than in `v_th` [samples].
-
-    It is 0 of a single pulse, and if noise hides a tenth of a sample: it also hides the harm then.
-
-    Args:
-        records: Unloaded and loaded voltage [V] of recordings with equal rates.
-        sigma: Standard deviations of their noise [V].
-        trains: The pulses of each `v_th`.
-    """
-    apart, alike = np.zeros(len(records)), dict[bytes, list[int]]()
-    for row, train in enumerate(trains):
-        if train.spacing is not None:
-            alike.setdefault(train.edges.tobytes(), []).append(row)
-    for rows in alike.values():
-        of = trains[rows[0]]
-        layout = rows, of.edges, _step(of.sample_rate / of.pulse_rate), of.sample_rate
-        both = [_edges_apart(records[:, which], *layout) for which in (0, 1)]
-        distance, error = (np.stack(part, axis=1) for part in zip(*both, strict=True))
-        seen = SURE * np.hypot(*(sigma[rows] * error).T) < APART
-        apart[rows] = np.where(seen, distance[:, 1] - distance[:, 0], 0.0)
-    return apart
+    lag = highest(np.einsum("rls,rs->rl", parts, template) - power / 2)
+    return (start + lag - (first - before)) / between
 
 
 def rise_time(sample_rate: float) -> int:
@@ -264,6 +210,107 @@ def highest(correlation: Float[np.ndarray, "*record lag"]) -> Float[np.ndarray, 
     inside = (top > 0) & (top < last) & (bend != 0)
     beside = np.where(inside, 0.5 * (left - right) / np.where(inside, bend, 1.0), 0.0)
     return np.asarray(top + beside)
+
+
+# --- Drift of one record against the other --------------------------------------------------------
+
+
+def largest_drift(sample_rate: float) -> float:
+    """Drift above which clocks differ [samples]."""
+    return max(DRIFT * sample_rate, DRIFT_SAMPLES)
+
+
+def clocks_apart(
+    records: Float[np.ndarray, "recording 2 time"],
+    sigma: Float[np.ndarray, "recording 2"],
+    trains: Sequence[PulseTrain],
+    lags: Sequence[float | None],
+) -> Float[np.ndarray, " recording"]:
+    """How far `v_out` drifts from `v_th` between the first and the last pulse [samples].
+
+    Three pulses are compared, the first, one in the middle and the last, of those that have room on
+    both sides. A drift is 0 with fewer pulses, if noise hides it, or if it is not steady: of a lost
+    sample or a disturbed period.
+
+    Args:
+        records: Unloaded and loaded voltage [V] of recordings with equal rates.
+        sigma: Standard deviations of their noise [V].
+        trains: The pulses of each `v_th`.
+        lags: Lags of `v_out` [samples], as `lags_of` finds them.
+    """
+    apart, alike = np.zeros(len(records)), dict[tuple[bytes, int], list[int]]()
+    for row, (train, lag) in enumerate(zip(trains, lags, strict=True)):
+        if train.spacing is not None and lag is not None:
+            alike.setdefault((train.edges.tobytes(), round(lag)), []).append(row)
+    for (_, late), rows in alike.items():
+        train = trains[rows[0]]
+        rise, step = rise_time(train.sample_rate), _step(train.sample_rate / train.pulse_rate)
+        width, off = 8 * step + 4 * rise, 2 * step + 2
+        room = train.edges + np.array([[min(late, 0)], [max(late, 0)]])
+        least = step + 1 + off  # an edge is within a step before its coarse place
+        fits = (room[0] >= least) & (room[1] + width + off + rise <= records.shape[2])
+        edges = train.edges[fits]
+        if edges.size < 3:
+            continue
+        first, middle, last = edges[[0, edges.size // 2, -1]].tolist()
+        window = int(min(width, room[0][fits][0] - off)), width
+        moved, error = np.zeros((2, 2, len(rows))), np.zeros((2, len(rows)))
+        for which, by in ((0, 0), (1, late)):
+            for number, later in enumerate((middle, last)):
+                at = first + by, later + by
+                found = _moved(records[:, which], rows, at, window, off, rise)
+                moved[which, number], error[which] = found
+        half, whole = moved[1] - moved[0]
+        steady = np.abs(half - whole * (middle - first) / (last - first)) < STEADY * np.abs(whole)
+        sure = SURE * np.hypot(*(error * sigma[rows].T)) < largest_drift(train.sample_rate)
+        every = (train.edges[-1] - train.edges[0]) / (last - first)
+        apart[rows] = np.where(steady & sure, every * whole, 0.0)
+    return apart
+
+
+def _moved(
+    v: Float[np.ndarray, "record time"],
+    rows: Sequence[int],
+    at: tuple[int, int],
+    window: tuple[int, int],
+    off: int,
+    rise: int,
+) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
+    """How much later than expected the second of two edges is [samples], up to `off`.
+
+    The second result is the standard error for white noise of standard deviation 1.
+    """
+    (first, later), (before, after) = at, window
+    template = rises(v[rows, first - before : first + after + rise], rise)
+    where = rises(v[rows, later - before - off : later + after + off + rise], rise)
+    parts = np.lib.stride_tricks.sliding_window_view(where, template.shape[1], axis=1)
+    power = np.einsum("rls,rls->rl", parts, parts)
+    top = np.argmax(np.einsum("rls,rs->rl", parts, template) - power / 2, axis=1)
+    lag, error = _within_a_sample(template, parts[np.arange(len(rows)), top], rise)
+    return top - off + lag, error
+
+
+def _within_a_sample(
+    one: Float[np.ndarray, "record time"], other: Float[np.ndarray, "record time"], rise: int
+) -> tuple[Float[np.ndarray, " record"], Float[np.ndarray, " record"]]:
+    """Lag of the other of two records that differ by less than a sample, and by a factor.
+
+    It is that of least squares. Aliases of a steep edge would move it by a tenth of a sample, so
+    that only frequencies below a quarter of the sample rate count. The second result is the lag's
+    standard error if both are rises of records with white noise of standard deviation 1.
+    """
+    count = 1 + one.shape[1] // 4
+    turn = 2j * np.pi * np.fft.rfftfreq(one.shape[1])[:count]
+    aim, turned = (np.fft.rfft(of)[:, :count] for of in (one, other))
+    size, power = (np.square(np.abs(of)) for of in (turned, turn * turned))
+    lag, total = np.zeros(len(one)), np.maximum(power.sum(1), TINY)
+    for _ in range(3):  # of half a sample, the third step is below 1e-4 samples
+        moved = turned * np.exp(turn * lag[:, None])
+        factor = (np.conj(moved) * aim).real.sum(1) / np.maximum(size.sum(1), TINY)
+        step = (np.conj(turn * moved) * aim).real.sum(1) / total
+        lag = np.clip(lag + step / np.where(factor > 0.1, factor, np.inf), -1.0, 1.0)
+    noise = one.shape[1] * np.square(np.abs(np.exp(turn * rise) - 1))
+    return lag, np.sqrt((power * noise).sum(1)) / total
 
 
 # --- Lag between two records ----------------------------------------------------------------------
