@@ -87,10 +87,10 @@ class Output:
         self, sample_rate: float, samples: int, rng: np.random.Generator
     ) -> Float[np.ndarray, " time"]:
         """Voltage at the converter [V], without noise."""
-        if self.lost is not None:
+        if self.lost is not None and self.lost < samples:
             whole = dataclasses.replace(self, lost=None).volts(sample_rate, samples + 1, rng)
             return np.delete(whole, self.lost)
-        if self.doubled is not None:
+        if self.doubled is not None and self.doubled < samples:
             whole = dataclasses.replace(self, doubled=None).volts(sample_rate, samples, rng)
             return np.insert(whole, self.doubled, whole[self.doubled])[:samples]
         sampler, time = self.sampler(sample_rate), np.arange(samples) / sample_rate
