@@ -11,6 +11,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 MADE_BY = {  # tables whose names are not those of their benchmarks
     "failures": "failure_map",
     "silent_failures": "failure_map",
+    "perturbation_pairs": "perturbations --pairs 500",
     "selection_map": "selection",
 }
 # No number of a benchmark depends on them.
