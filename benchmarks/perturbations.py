@@ -91,9 +91,7 @@ def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[s
     return {path: np.array(list(of.relative.values())) for path, of in etid.bound(scene).items()}
 
 
-def answers_of(
-    names: Sequence[str], number: int, snr_db: float, parts: float = PARTS
-) -> list[Answer]:
+def answers_of(names: Sequence[str], number: int, snr_db: float, parts: float) -> list[Answer]:
     """All answers behind one driver with one noise; perturbations that share a driver together."""
     drivers, found = Drivers(), list[Answer]()
     together: dict[int, tuple[etid.Driver | None, list[tuple[str, Record, Truth]]]] = {}
@@ -200,7 +198,8 @@ def pairs(arguments: argparse.Namespace) -> bool:
     for of in silent:
         far = f"{np.nanmax(in_stderrs(of)):.1f} standard errors"
         print(f"silent: {of.perturbation}, {of.path} at {of.snr_db:g} dB, seed {of.seed}: {far}")
-    return report([Target.of(TARGETS, [*TARGETS][-1], float(len(alone)))])
+    *_, missed = TARGETS
+    return report([Target.of(TARGETS, missed, float(len(alone)))])
 
 
 def main(arguments: argparse.Namespace) -> bool:

@@ -153,6 +153,13 @@ def test_draws_keep_to_the_bounds_and_agree_with_the_fit(free, beyond):
     assert beyond.intervals()["r_s"][0] == above(free, 1.0)
 
 
+def r_p_at(bound, free):
+    """R_p and its error where R_s is at a bound: a normal distribution, up to the skew at 20 dB."""
+    cov = np.asarray(free.cov)
+    middle = float(free.circuit.r_p) + cov[0, 1] / cov[0, 0] * (bound - float(free.circuit.r_s))
+    return middle, np.sqrt(cov[1, 1] - cov[0, 1] ** 2 / cov[0, 0])
+
+
 @pytest.mark.slow
 def test_profiles_keep_to_the_bounds(free, beyond):
     bound = above(free, 1.0)
@@ -163,10 +170,7 @@ def test_profiles_keep_to_the_bounds(free, beyond):
     assert np.all(np.diff(own.deviance) > 0)
     assert own.interval()[0] == bound
     assert other.deviance.min() > -1e-3
-    # That of a normal distribution of R_p at the bound of R_s, up to the skew at 20 dB.
-    cov = np.asarray(free.cov)
-    middle = float(free.circuit.r_p) + cov[0, 1] / cov[0, 0] * (bound - float(free.circuit.r_s))
-    error = np.sqrt(cov[1, 1] - cov[0, 1] ** 2 / cov[0, 0])
+    middle, error = r_p_at(bound, free)
     likeliest = other.values[np.argmin(other.deviance)]
     ends = likeliest, other.interval()[1]
     np.testing.assert_allclose(ends, [middle, middle + 1.96 * error], rtol=0, atol=0.4 * error)
@@ -184,10 +188,7 @@ def test_profiles_of_other_elements_keep_to_an_upper_bound(noisy, free):
     """R_s may not be above its bound, so R_p, which has its sum with R_s, may hardly be below."""
     bound = above(free, -1.0)
     profile = etid.identify_skin(noisy, bounds={"r_s": (None, bound)}).profile("r_p")
-    cov = np.asarray(free.cov)
-    middle = float(free.circuit.r_p) + cov[0, 1] / cov[0, 0] * (bound - float(free.circuit.r_s))
-    error = np.sqrt(cov[1, 1] - cov[0, 1] ** 2 / cov[0, 0])
-    # That of a normal distribution of R_p at the bound of R_s, up to the skew at 20 dB.
+    middle, error = r_p_at(bound, free)
     low = profile.interval()[0]
     np.testing.assert_allclose(low, middle - 1.96 * error, rtol=0, atol=0.4 * error)
 

@@ -43,9 +43,8 @@ def code(commit, name):
         return found.stdout
     tree = ast.parse(found.stdout)
     for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(
-            node
-        ):
+        described = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        if described and ast.get_docstring(node) is not None:
             del node.body[0]
     return ast.dump(tree)
 

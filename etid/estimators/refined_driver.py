@@ -49,9 +49,9 @@ def from_harmonics(
     The fits from all starts use bands of harmonics. The best is refined with all harmonics of the
     bands in which V_th exceeds its noise.
     """
-    spectra, rate = above_noise(records.spectrum), jnp.asarray(records.sample_rate)[0]
+    bands, rate = banded(records.spectrum), jnp.asarray(records.sample_rate)[0]
+    spectra = above_noise(records.spectrum, bands)
     baseline = iteration.periodic_driver_filter(spectra, r_load, rate, order)
-    bands = banded(spectra)
 
     def fit(start: SourceImpedance) -> maximum_likelihood.Rough:
         return maximum_likelihood.rough_source(spectra, bands, r_load, rate, start)

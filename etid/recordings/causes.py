@@ -42,7 +42,7 @@ def sizes(voltage: float, current: float) -> str:
 
 def why_rates_differ(inspected: Inspected) -> str:
     """How the pulses contradict the rates, or those of one record those of the other."""
-    if not inspected.clocks_differ:
+    if inspected.train.mismatch:
         return inspected.train.mismatch
     word = "farther" if inspected.apart > 0 else "less far"
     between = inspected.spacing * (inspected.train.edges.size - 1)

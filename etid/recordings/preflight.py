@@ -151,9 +151,8 @@ class Inspected:
     @property
     def clocks_differ(self) -> bool:
         """Whether `v_out` drifts away from `v_th` from pulse to pulse."""
-        if self.has_current or self.train.mismatch:
-            return False
-        return bool(abs(self.apart) > largest_drift(self.recording.sample_rate))
+        largest = largest_drift(self.recording.sample_rate)
+        return not self.has_current and bool(abs(self.apart) > largest)
 
     @property
     def remarks(self) -> Remark:

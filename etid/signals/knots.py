@@ -125,39 +125,17 @@ def _bands(harmonics: int) -> Int[np.ndarray, " harmonic"]:
     return np.asarray(band[:harmonics])
 
 
-def _summed(
-    spectrum: Spectrum, values: Float[Array, "*lane harmonic"]
-) -> Float[Array, "*lane band"]:
-    """Sums over the selected harmonics of each band."""
-    band = _bands(spectrum.frequency.shape[-1])
-    zero = jnp.zeros((*values.shape[:-1], int(band[-1]) + 1))
-    return zero.at[..., band].add(jnp.where(spectrum.selected, values, 0.0))
-
-
-def _size_and_signal(spectrum: Spectrum) -> tuple[Array, Array, Array]:
-    """Σ |X|² of each band, the part that is not noise, and whether this is more than half."""
-    size = _summed(spectrum, power(spectrum.x))
-    signal = size - _summed(spectrum, spectrum.variance_x)
-    return size, signal, signal > size / 2  # False where no harmonic is selected
-
-
-def above_noise(spectrum: Spectrum) -> Spectrum:
-    """The harmonics of each recording, selected in the bands in which X exceeds its noise.
-
-    The others say little of Y/X. But a driver has ten parameters, and some Z_th agrees with their
-    noise so well that a fit leaves the minimum which the other harmonics have, for one that is
-    silently wrong: of 200 calibrations at 30 dB in two. At 20 dB, where half of the harmonics are
-    left out, C_p of dry skin scatters by a sixth more.
-    """
-    present = _size_and_signal(spectrum)[2][..., _bands(spectrum.frequency.shape[-1])]
-    return dataclasses.replace(spectrum, selected=spectrum.selected & present)
-
-
 def banded(spectrum: Spectrum) -> Spectrum:
     """The harmonics of each recording, summed over bands; selected where X exceeds its noise."""
-    band, summed = _bands(spectrum.frequency.shape[-1]), functools.partial(_summed, spectrum)
-    size, signal, present = _size_and_signal(spectrum)
-    count = summed(jnp.ones_like(spectrum.variance_x))
+    band = _bands(spectrum.frequency.shape[-1])
+
+    def summed(values: Float[Array, "*lane harmonic"]) -> Float[Array, "*lane band"]:
+        zero = jnp.zeros((*values.shape[:-1], int(band[-1]) + 1))
+        return zero.at[..., band].add(jnp.where(spectrum.selected, values, 0.0))
+
+    count, size = summed(jnp.ones_like(spectrum.variance_x)), summed(power(spectrum.x))
+    signal = size - summed(spectrum.variance_x)
+    present = signal > size / 2  # half of |X|² is signal; False where no harmonic is selected
     signal, size = (jnp.where(present, sums, 1.0) for sums in (signal, size))
     level, product = jnp.sqrt(signal), jnp.conj(spectrum.x) * spectrum.y
 
@@ -182,3 +160,19 @@ def banded(spectrum: Spectrum) -> Spectrum:
         variance_y=variance(spectrum.variance_y),
         selected=present,
     )
+
+
+def above_noise(spectrum: Spectrum, bands: Spectrum) -> Spectrum:
+    """The harmonics of each recording, selected in the bands in which X exceeds its noise.
+
+    The others say little of Y/X. But a driver has ten parameters, and some Z_th agrees with their
+    noise so well that a fit leaves the minimum which the other harmonics have, for one that is
+    silently wrong: of 200 calibrations at 30 dB in two. At 20 dB, where half of the harmonics are
+    left out, C_p of dry skin scatters by a sixth more.
+
+    Args:
+        spectrum: The harmonics.
+        bands: The same, as `banded` sums them.
+    """
+    present = bands.selected[..., _bands(spectrum.frequency.shape[-1])]
+    return dataclasses.replace(spectrum, selected=spectrum.selected & present)

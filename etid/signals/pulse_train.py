@@ -182,12 +182,21 @@ def _spacings(
     between = edges.size - 1
     if where.shape[1] < template.shape[1]:  # the last edge is at the end of the record
         return np.full(rows.size, (last - first) / between)
-    # Least squares of the difference. The correlation alone is biased towards the steepest part of
-    # a slow edge.
+    lag = highest(_compared(template, where)[1])
+    return (start + lag - (first - before)) / between
+
+
+def _compared(
+    template: Float[np.ndarray, "record part"], where: Float[np.ndarray, "record time"]
+) -> tuple[Float[np.ndarray, "record lag part"], Float[np.ndarray, "record lag"]]:
+    """The parts of records as long as a template, and how much they are like it.
+
+    That is by least squares of the difference. The correlation alone is biased towards the steepest
+    part of a slow edge.
+    """
     parts = np.lib.stride_tricks.sliding_window_view(where, template.shape[1], axis=1)
     power = np.einsum("rls,rls->rl", parts, parts)
-    lag = highest(np.einsum("rls,rs->rl", parts, template) - power / 2)
-    return (start + lag - (first - before)) / between
+    return parts, np.einsum("rls,rs->rl", parts, template) - power / 2
 
 
 def rise_time(sample_rate: float) -> int:
@@ -283,9 +292,8 @@ def _moved(
     (first, later), (before, after) = at, window
     template = rises(v[rows, first - before : first + after + rise], rise)
     where = rises(v[rows, later - before - off : later + after + off + rise], rise)
-    parts = np.lib.stride_tricks.sliding_window_view(where, template.shape[1], axis=1)
-    power = np.einsum("rls,rls->rl", parts, parts)
-    top = np.argmax(np.einsum("rls,rs->rl", parts, template) - power / 2, axis=1)
+    parts, likeness = _compared(template, where)
+    top = np.argmax(likeness, axis=1)
     lag, error = _within_a_sample(template, parts[np.arange(len(rows)), top], rise)
     return top - off + lag, error
 
