@@ -1,8 +1,9 @@
 """Are intervals honest when an instrument has the errors that its tolerances allow?
 
 Each study of `benchmarks.perturbed_study.undisturbed` gets errors that are drawn from the stated
-tolerances, one kind at a time or all of them, in its calibration and in dry and damp skin. Printed
-is the coverage (with the targets of `benchmarks.coverage`) of fits behind a driver and of joint
+tolerances, one kind at a time or all of them, in its calibration and in dry and damp skin; a drift
+changes all parts of the driver, independently. Printed is the coverage (with the targets of
+`benchmarks.coverage`) of fits behind a driver and of joint
 fits.
 """
 
@@ -15,12 +16,20 @@ import numpy as np
 import etid
 from benchmarks import perturbed_study as lab
 from benchmarks.coverage import JOINT, Draws, draw, targets
+from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS
 from benchmarks.runner import WORKERS, Target, each, option, report
 
 TRUTH = {path: dataclasses.astuple(skin) for path, skin in LOADS.items()}
 FIRST = 5000  # number of the first driver
-SIZES = {"gain": 2e-3, "r_load": 2e-3, "crosstalk": 2e-3, "capacitance": 2e-12}  # [relative, F]
+SIZES = {  # [relative, F, s]
+    "gain": 2e-3,
+    "r_load": 2e-3,
+    "crosstalk": 2e-3,
+    "capacitance": 2e-12,
+    "drift": 5e-3,
+    "delay": 5e-9,
+}
 KINDS = {**{name: (name,) for name in SIZES}, "all": tuple(SIZES)}
 MODES = ("behind a driver", JOINT)
 
@@ -43,8 +52,18 @@ def study(number: int, snr_db: float, names: Sequence[str]) -> etid.Study:
     of = lab.all_records(lab.crosstalk(0.0, error["crosstalk"]))(of)
     of = lab.trials(lab.shunted(error["capacitance"]))(of)
     of = lab.calibrations(lab.record(r_load=lab.REFERENCE / (1 + error["r_load"])))(of)
+    if "drift" in names:  # of all parts, independently
+        later = lab.drawn_driver(FIRST + number, SIZES["drift"], of.trials[0].out.driver)
+        of = lab.trials(lab.both(driver=later))(of)
+    if "delay" in names:
+        of = lab.all_records(lambda one: _after(one, SIZES["delay"] * rng.standard_normal()))(of)
     records = [one.recording(number) for one in (*of.calibrations, *of.trials)]
     return etid.Study.from_recordings(records)
+
+
+def _after(of: Record, delay: float) -> Record:
+    """The record with V_out after V_th by this delay [s]."""
+    return lab.out(delay=of.th.delay + delay)(of)
 
 
 def fits_of(of: etid.Study, mode: str, instrument: etid.Instrument) -> Mapping[str, etid.Fit]:
@@ -61,8 +80,10 @@ def fits_of(of: etid.Study, mode: str, instrument: etid.Instrument) -> Mapping[s
 
 def answers(number: int, snr_db: float, kind: str, mode: str) -> list[tuple]:
     """A row of `Draws` for each skin."""
-    instrument = etid.Instrument(**{name: SIZES[name] for name in KINDS[kind]})
-    fits = fits_of(study(number, snr_db, KINDS[kind]), mode, instrument)
+    # A joint fit has no drift.
+    names = [name for name in KINDS[kind] if not (mode == JOINT and name == "drift")]
+    instrument = etid.Instrument(**{name: SIZES[name] for name in names})
+    fits = fits_of(study(number, snr_db, names), mode, instrument)
     return [draw(fits.get(path), true) for path, true in TRUTH.items()]
 
 
@@ -70,7 +91,7 @@ def main(arguments: argparse.Namespace) -> bool:
     asked: list[Target] = []
     for snr_db in arguments.snr_db:
         for kind in arguments.only or KINDS:
-            for mode in arguments.mode:
+            for mode in arguments.mode if kind != "drift" else MODES[:1]:
                 numbers = range(FIRST, FIRST + arguments.draws)
                 tasks = [(number, snr_db, kind, mode) for number in numbers]
                 found = dict(each(answers, tasks, arguments.workers, "draw", "tolerances"))

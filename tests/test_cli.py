@@ -236,7 +236,7 @@ OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
         ("report fits.h5 -o page.pdf", "page.pdf: the file is not written as .pdf; "),
         ("fit study.h5 -o calibration.h5", "this file exists; add --force to replace"),
         ("fit study.h5 -o f.h5 --joint --method output_error", "--joint uses maximum_likelihood"),
-        ("fit study.h5 -o f.h5 --joint --driver-drift 0.1", "remove --driver-drift"),
+        ("fit study.h5 -o f.h5 --joint --tolerance drift=0.1", "no drift between them"),
         ("fit study.h5 -o f.h5 --joint --driver d.h5", "remove --driver, or --joint"),
         ("fit study.h5 -o f.h5 --joint --resume", "--joint is one fit per driver"),
         ("report study.h5", "run etid fit first"),

@@ -38,7 +38,7 @@ class Proportion(AbstractEstimator):
         x, y = (v - v.mean(-1, keepdims=True) if self.offset else v for v in (m.v_th, m.v_out))
         return jnp.sum(x * y, -1) / jnp.sum(x * x, -1)
 
-    def fit_driver(self, records, r_load, order):
+    def fit_driver(self, records, r_load, order, instrument):
         r_th = jnp.mean(r_load * (1 / self.ratio(records) - 1))
         nothing, one = jnp.asarray(0.0), jnp.asarray(1.0)
         return DiscreteDriver(

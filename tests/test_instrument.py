@@ -20,7 +20,7 @@ from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import given
 from etid.online.current import CurrentModel
 from etid.results.driver import ContinuousDriver, HarmonicDriver
-from etid.results.instrument import TOLERANCES
+from etid.results.instrument import ERRORS
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 from tests.skins import DAMP, DRY, off, relative
@@ -113,7 +113,7 @@ def test_two_records_of_one_resistor_have_one_error_of_it():
 
 def test_a_budget_says_what_an_error_that_nobody_stated_does():
     right = fitted(*exact())
-    for source, (_, size) in TOLERANCES.items():
+    for source, size in ERRORS.items():
         error: dict[str, Any] = {source: size}
         before, after = (
             np.log(np.asarray(fit.circuit.values())) for fit in (right, fitted(*records(**error)))
@@ -130,13 +130,63 @@ def test_the_parts_of_a_budget_are_the_variances_of_the_fit():
     fit = fitted(*exact(), ALL)
     budget = fit.budget()
     np.testing.assert_allclose(budget.together, relative(fit), rtol=1e-6)
-    assert {"recording", "driver", *TOLERANCES} == set(budget.parts)
+    assert {"recording", "driver", *ERRORS} == set(budget.parts)
     # Of a known resistor nothing is seen: its tolerance passes 1:1.
     np.testing.assert_allclose(budget.parts["r_load"], 2e-3, rtol=0.05)
     text = str(budget)
     assert "gain 0.2 %" in text
     assert "capacitance 2 pF" in text
     assert "together" in text
+
+
+def test_the_drift_of_a_budget_is_what_its_tolerance_adds():
+    without, stated = (fitted(*exact(), of) for of in (None, etid.Instrument(drift=1e-4)))
+    part = stated.budget().parts["drift"]
+    np.testing.assert_allclose(stated.budget().together, relative(stated), rtol=1e-6)
+    # Of so small a drift the fit estimates a few per cent, and less of a smaller one.
+    np.testing.assert_allclose(part, 0.01 * without.budget().unstated["drift"], rtol=0.05)
+    added = relative(stated) ** 2 - relative(without) ** 2
+    np.testing.assert_allclose(part, np.sqrt(added), rtol=0.05)
+
+
+def test_a_stated_delay_narrows_the_errors_and_a_larger_one_contradicts_it():
+    calibration, skin = trials({"skin": DRY}, trigger_jitter_rms=1e-9).recordings()
+    without, stated = (fitted(calibration, skin, of) for of in (None, etid.Instrument(delay=1e-9)))
+    assert stated.verdict == "successful"
+    assert np.abs(off(stated, DRY)).max() < 4
+    c_p = list(DRY.names()).index("c_p")
+    # The bounds of `python -m benchmarks delays`: 0.36 and 0.14 %, for six periods less.
+    assert relative(stated)[c_p] < 0.5 * relative(without)[c_p]
+    late = [*trials({"skin": DRY}, trigger_jitter_rms=100e-9, seed=2).recordings()]
+    assert fitted(*late).verdict == "successful"
+    assert fitted(*late, etid.Instrument(delay=1e-9)).verdict != "successful"
+
+
+def test_an_instrument_is_a_field_of_the_calibrations(tmp_path):
+    calibration, skin = exact()
+    told = calibration.replace(instrument="gain=1e-3 drift=0.01 delay=2e-9")
+    etid.Study.from_recordings([told, skin]).write(tmp_path / "study.h5")
+    with etid.read(tmp_path / "study.h5") as study:
+        assert study["calibration"].instrument == told.instrument
+        fits = etid.identify_study(study)
+    (driver,) = fits.drivers.values()
+    assert isinstance(driver, ContinuousDriver)
+    assert driver.instrument is not None
+    assert driver.instrument.stored() == {"gain": 1e-3, "drift": 1e-2, "delay": 2e-9}
+    stated = fitted(calibration, skin, etid.Instrument(gain=1e-3, drift=0.01, delay=2e-9))
+    np.testing.assert_array_equal(np.asarray(fits.fits.cov[0]), np.asarray(stated.cov))
+    # What is passed counts.
+    assert fitted(told, skin, GAIN).source_or_own(None, None)[1].instrument.stored() == {
+        "gain": 1e-3
+    }
+    for text, message in (("gain=x", "is no number"), ("gains=1", "is none of gain")):
+        with pytest.raises(etid.RecordingError, match=message):
+            etid.identify_driver(calibration.replace(instrument=text))
+    other = records(seed=1)[0].replace(path="again", instrument="gain=2e-3")
+    with pytest.raises(etid.RecordingError, match="same tolerances"):
+        etid.identify_driver([told, other])
+    with pytest.raises(ValueError, match="no drift between them"):
+        etid.identify_jointly(etid.Study.from_recordings([told, skin]))
 
 
 def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax():
@@ -174,7 +224,7 @@ def test_a_joint_fit_has_the_errors_of_the_instrument(shared):
         assert np.abs(off(fit, skin)).max() < 4
         budget = fit.budget(study[path], driver)
         np.testing.assert_allclose(budget.together, relative(fit), rtol=1e-6)
-        assert {"recording", "driver", *TOLERANCES} == set(budget.parts)
+        assert {"recording", "driver", *ERRORS} == set(budget.parts)
         np.testing.assert_allclose(budget.parts["r_load"], 2e-3, rtol=0.05)
     narrow = together(study, etid.Instrument(gain=1e-4))
     assert {fit.verdict for fit in narrow.values()} == {"inconsistent"}
@@ -196,8 +246,8 @@ def test_a_budget_of_a_joint_fit_says_what_an_error_that_nobody_stated_does():
     (driver,) = found.drivers.values()
     budget = found.fits[0].budget(right["0"], driver)
     # 1 pF moves the driver of a joint fit along its curved valley: its effect is not linear.
-    for source in sorted({*TOLERANCES} - {"capacitance"}):
-        error: dict[str, Any] = {source: TOLERANCES[source][1]}
+    for source in sorted({*ERRORS} - {"capacitance"}):
+        error: dict[str, Any] = {source: ERRORS[source]}
         wrong = trials(loads, trigger_jitter_rms=50e-9, **error)
         other = together(wrong)["0"]
         before, after = (np.log(np.asarray(of.circuit.values())) for of in (found.fits[0], other))
@@ -254,7 +304,7 @@ def tracked(calibration, skin, instrument):
 @pytest.mark.parametrize("kind", ["dry", pytest.param("damp", marks=pytest.mark.slow)])
 def test_a_tracker_has_the_errors_of_the_instrument(kind):
     _, before, without = tracked(*exact(kind), etid.Instrument())
-    for source, (_, size) in TOLERANCES.items():
+    for source, size in ERRORS.items():
         error: dict[str, Any] = {source: size}
         *_, stated = tracked(*exact(kind), etid.Instrument(**error))
         fit, after, _ = tracked(*records(SKINS[kind], **error), etid.Instrument(**error))

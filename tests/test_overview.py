@@ -90,7 +90,7 @@ def found_driver():
         calibration=known,
         chi2=jnp.asarray(7.654321),
         rrse=jnp.asarray(0.0123456),
-        drift=np.asarray(0.02),
+        instrument=etid.Instrument(drift=0.02).as_arrays(),
         remarks=np.asarray(int(Remark.mains_hum)),
         result=verdict("misfit"),
     )

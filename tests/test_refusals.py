@@ -142,9 +142,9 @@ etid.identify_driver(of.calibration, plausible=(3e5, 3e2)) -> plausible: is \(30
 etid.identify_study(of.study, plausible=(-1.0, 3e2)) -> plausible: is \(\-1\.0, 300\.0\), must be
 etid.identify_jointly(of.study, plausible=(1.0, np.nan)) -> plausible: is \(1\.0, nan\), must be
 etid.fit_file('absent.h5', 'fits.h5', plausible=(1.0, 1.0)) -> plausible: is \(1\.0, 1\.0\), must
-etid.identify_study(of.study, driver_drift=-0.1) -> driver_drift is \-0\.1; it must be at least 0
-etid.fit_file('absent.h5', 'fits.h5', driver_drift=1.0) -> driver_drift is 1\.0; it must be
-etid.identify_study(of.study, method='equation_error', driver_drift=0.1) -> gives none
+etid.Instrument(drift=1.0) -> drift .* is 1\.0; it is a standard deviation \[relative\], at least
+etid.Instrument(delay=1.0) -> delay .* is 1\.0; it is a standard deviation \[s\], at least
+etid.identify_study(of.study, method='equation_error', instrument=etid.Instrument()) -> gives none
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=-0.1)) -> r_load .* is \-0\.1; it
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=np.nan)) -> r_load .* is nan; it
 etid.identify_study(of.study, method='equation_error', fixed={'r_s': 1.0}) -> no known elements

@@ -22,7 +22,8 @@ from etid.estimators import registry
 from etid.files import exporting
 from etid.identify.options import Options
 from etid.report import figures, methods, tables
-from etid.report.waveforms import find, picture, worst
+from etid.report.budget import budgets
+from etid.report.waveforms import find, picture, relative_stderr, worst
 from etid.results.driver import ContinuousDriver, DiscreteDriver
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message
@@ -31,6 +32,7 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 from tests import pictures
 
+EXAMPLE = pathlib.Path(__file__).parents[1] / "data_schema" / "example.h5"
 EVIL = r"<script>document.title='$\broken{$'</script>"
 TRUE = {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
 PATHS = [*(f"loaded/{i}" for i in range(5)), r"loaded/$\frac$"]
@@ -398,14 +400,32 @@ def test_the_methods_are_told_in_120_words_and_in_full_behind_them(found, study_
     assert "{schwarz1978," in by_calibrations.code
 
 
+def test_the_budget_is_that_of_the_fit_with_the_median_error(tmp_path):
+    with etid.read(EXAMPLE) as study:
+        found = etid.identify_study(study)
+        found.write(tmp_path / "fits.h5")
+        errors = relative_stderr(found.fits)
+        row = int(np.argsort(errors)[2])
+        path = found.fits.labels["path"][row]
+        wanted = found.fits[row].budget(study[path], *found.drivers.values())
+        again = StudyFits.read(tmp_path / "fits.h5")
+        for of in (found, again):  # a file holds no harmonics of the calibrations
+            [section] = budgets(of, study)
+            assert path in section.text
+            [table] = section.tables
+            assert table.rows == tuple(wanted._overview().rows)
+        assert budgets(found, None) == []
+
+
 @pytest.mark.parametrize("method", [*registry.names(), "joint", "online", TWO])
 def test_methods_cite_what_they_name_and_say_the_settings(found, method):
     fit = dataclasses.replace(found.fits.fit, method=method)
-    told = {"order": 4, "instrument": ("gain 0.001", "r_load 0.001")}
-    settings = dataclasses.replace(found.settings, **told)
+    settings = dataclasses.replace(found.settings, order=4)
+    told = etid.Instrument(gain=1e-3, r_load=1e-3).as_arrays()
     by = method.partition(" + ")[0]
     drivers = {
-        paths: dataclasses.replace(driver, method=by) for paths, driver in found.drivers.items()
+        paths: dataclasses.replace(driver, method=by, instrument=told)
+        for paths, driver in found.drivers.items()
     }
     section = methods.methods_section(
         dataclasses.replace(

@@ -23,7 +23,7 @@ from etid.recordings.errors import RecordingError, install
 from etid.recordings.replacing import HDF5, claimed
 from etid.report.html import Table
 from etid.results.driver import Order
-from etid.results.instrument import TOLERANCES, Instrument
+from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.results.verdicts import message, own_part
 
@@ -57,9 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
          "value of an element with its standard deviation [SI], such as r_s=500,50"),
         ("--bound", "r_s=100:2000", "ELEMENT=LOWER:UPPER",
          "bounds of an element [SI], such as r_s=100:2000, or r_s=100: without an upper one"),
-        ("--tolerance", "gain=1e-3", "NAME=VALUE",
-         "standard deviation of an error of the instrument: gain, r_load or crosstalk [relative], "
-         "or capacitance [F], such as gain=1e-3"),
     ):  # fmt: skip
         parser.add_argument(
             option,
@@ -70,11 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help=f"{purpose}; may be repeated",
         )
     parser.add_argument(
-        "--driver-drift",
-        type=float,
-        default=0.0,
-        metavar="PART",
-        help="possible relative change of Z_th since its calibration, such as 0.01; default 0",
+        "--tolerance",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="standard deviation of an error of the instrument: gain, r_load, crosstalk or drift "
+        "[relative], capacitance [F] or delay [s], such as gain=1e-3; may be repeated",
     )
     parser.add_argument(
         "--plausible",
@@ -143,12 +141,12 @@ def _by_name(option: str, known: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(known)
 
 
-def _instrument(told: list[tuple[str, float]]) -> Instrument | None:
+def _instrument(told: list[str]) -> Instrument | None:
     """The tolerances of --tolerance."""
-    for name, _ in told:
-        if name not in TOLERANCES:
-            raise ValueError(f"--tolerance knows no {name!r}; write {', '.join(TOLERANCES)}")
-    return Instrument(**_by_name("--tolerance", told)) if told else None
+    try:
+        return Instrument.read(" ".join(told)) if told else None
+    except ValueError as error:
+        raise ValueError(f"--tolerance {error}") from None
 
 
 def _workers(text: str) -> int:
@@ -167,8 +165,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Identify the drivers and loads, and write the file of fits."""
     if arguments.joint and arguments.method not in (None, "maximum_likelihood"):
         raise ValueError(f"--joint uses maximum_likelihood; remove --method {arguments.method}")
-    if arguments.joint and arguments.driver_drift:
-        raise ValueError("--joint identifies the driver itself; remove --driver-drift")
     if arguments.joint and arguments.driver:
         raise ValueError("--joint identifies the driver itself; remove --driver, or --joint")
     options = {
@@ -204,7 +200,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 driver=arguments.driver,
                 order=arguments.order,
                 method=arguments.method,
-                driver_drift=arguments.driver_drift,
                 resume=arguments.resume,
                 executor=executor,
                 progress=progress,

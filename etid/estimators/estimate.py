@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.results.driver import SourceImpedance
 from etid.results.fit import Support
+from etid.results.instrument import Instrument
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 MAX_STEPS = 500
@@ -148,6 +149,13 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     centre, width = ravel_pytree(centre)[0], ravel_pytree(width)[0]
     frequency = jnp.asarray(PASSIVE_BAND) * sample_rate
     return Prior(start, centre, width, frequency, 1e-3 * r_load)
+
+
+def delay_width(instrument: Instrument | None, sample_rate: Float[Array, ""]) -> Float[Array, ""]:
+    """Standard deviation of the prior of a delay behind this instrument [samples]."""
+    if instrument is None or instrument.delay is None:
+        return jnp.asarray(DELAY_WIDTH)
+    return jnp.minimum(instrument.delay * sample_rate, DELAY_WIDTH)
 
 
 def delay_std(r_load: Float[Array, " record"]) -> Float[Array, ""]:

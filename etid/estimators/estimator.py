@@ -18,6 +18,7 @@ from etid.estimators.lanes import AbstractLane
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
+from etid.results.instrument import Instrument
 
 CHECKED = (
     "the records passed the checks for flat, clipped, missing and misplaced samples",
@@ -127,6 +128,7 @@ class AbstractEstimator(abc.ABC):
         records: Any,
         r_load: Float[Array, " record"],
         order: int,
+        instrument: Instrument | None,
     ) -> Driver:
         """Identify a driver.
 
@@ -135,6 +137,7 @@ class AbstractEstimator(abc.ABC):
                 this estimator are `periodic`, else their `Measurement`.
             r_load: Resistor of each calibration [Ω].
             order: Number of poles of Z_th.
+            instrument: Tolerances of the instrument, for the fits of loads; None if it has none.
         """
 
     @abc.abstractmethod

@@ -19,6 +19,7 @@ from etid.estimators.score_tests import of_calibrations
 from etid.estimators.starts import source_starts
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.results.driver import Calibration, ContinuousDriver, HarmonicDriver, SourceImpedance
+from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.knots import above_noise, banded
 from etid.signals.noise import Measurement
@@ -42,7 +43,11 @@ def is_split(source: SourceImpedance) -> Bool[Array, ""]:
 
 
 def from_harmonics(
-    records: Harmonics, r_load: Float[Array, " record"], order: int, method: str
+    records: Harmonics,
+    r_load: Float[Array, " record"],
+    order: int,
+    method: str,
+    instrument: Instrument | None,
 ) -> HarmonicDriver:
     """Refine Z_th by maximum likelihood.
 
@@ -63,7 +68,7 @@ def from_harmonics(
     ranked = jnp.argsort(jax.vmap(_cost)(found.source, found.cost, passive))
     candidates = jax.tree.map(lambda leaf: leaf[ranked], found)
     calibrations, estimate, near, linear = maximum_likelihood.fit_source(
-        spectra, r_load, rate, candidates
+        spectra, r_load, rate, candidates, instrument
     )
     estimate = dataclasses.replace(estimate, start=ranked[estimate.start])
     source, calibration = calibrations.source, calibrations.calibration
@@ -83,12 +88,17 @@ def from_harmonics(
         ),
         method=method,
         spectra=spectra,
+        instrument=instrument,
         missing_pole=statistic,
     )
 
 
 def from_samples(
-    m: Measurement, r_load: Float[Array, " record"], order: int, method: str
+    m: Measurement,
+    r_load: Float[Array, " record"],
+    order: int,
+    method: str,
+    instrument: Instrument | None,
 ) -> ContinuousDriver:
     """Refine Z_th by output error."""
     rate = m.sample_rate[0]
@@ -126,6 +136,7 @@ def from_samples(
         source=source,
         calibration=calibration,
         result=first_verdict(*_faults(estimate, calibration, passive, terms)),
+        instrument=instrument,
         method=method,
     )
 

@@ -188,13 +188,6 @@ def order_of(value: Any) -> Order:
     )
 
 
-def part_of(field: str, value: Any) -> float:
-    """A relative standard deviation."""
-    if not 0 <= (part := number_of(field, value)) < 1:
-        raise ValueError(f"{field} is {value}; it must be at least 0 and below 1")
-    return part
-
-
 def range_of(field: str, value: Any) -> tuple[float, float]:
     """A range of impedances [Ω].
 

@@ -5,6 +5,7 @@ import functools
 import logging
 import operator
 from collections.abc import Sequence
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -17,7 +18,13 @@ from etid.estimators.score_tests import of_calibrations
 from etid.identify import changes
 from etid.identify.arguments import check_alike, check_distinct, recordings
 from etid.identify.fitting import better_of, checksum, may_hum
-from etid.identify.options import Options, check_instrument, check_order, for_calibrations
+from etid.identify.options import (
+    Options,
+    check_instrument,
+    check_order,
+    for_calibrations,
+    instrument_of,
+)
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
@@ -32,6 +39,10 @@ from etid.results.study_fits import PLAUSIBLE
 from etid.results.verdicts import message, verdict
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 from etid.signals import mains
+from etid.signals.harmonics import Spectrum
+from etid.signals.knots import above_noise, banded
+
+Lane = TypeVar("Lane", Harmonics, AlignedSamples)
 
 
 @in_float64
@@ -41,7 +52,6 @@ def identify_driver(
     order: Order = 5,
     method: Method | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
-    driver_drift: float = 0.0,
     instrument: Instrument | None = None,
     throw: bool = True,
 ) -> Driver:
@@ -58,11 +68,9 @@ def identify_driver(
             records allow it, else output error.
         plausible: Smallest and largest |Z_th| [Ω] at 1 kHz that is accepted. The default range
             spans a factor of 1000: a driver within the range leaves it if `r_load` is given in kΩ.
-        driver_drift: Relative standard deviation of the change of each parameter of Z_th between
-            the calibration and the recording of a skin. It enters the standard errors of the
-            skins, as part of `shared_cov`.
         instrument: Tolerances of the instrument, as in `etid.Instrument(gain=1e-3)`. They enter the
-            standard errors of the skins, by maximum likelihood, as part of `shared_cov`.
+            standard errors of the skins, as part of `shared_cov`. All but a drift need maximum
+            likelihood. If not given, it is that of the calibrations (`Recording.instrument`).
         throw: Raise an error if the verdict is not successful.
 
     Returns:
@@ -70,16 +78,14 @@ def identify_driver(
 
     Raises:
         ValueError: There is no calibration, a calibration has no `r_load`, one is given twice,
-            their lengths or rates differ, the order is below 2, `driver_drift` is not in
-            0 ≤ drift < 1, or the method gives no standard errors that it could enter, or has no
-            likelihood that could choose the order.
+            their lengths, rates or instruments differ, the order is below 2, or the method has no
+            likelihood that could choose the order, or nothing that the tolerances could enter.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     options = Options.of(
         order=order,
         method=method,
         plausible=plausible,
-        driver_drift=driver_drift,
         instrument=instrument,
     )
     single = isinstance(calibrations, Recording)
@@ -120,11 +126,13 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     for one in seen:
         _refused(one, "biased" if estimator.lane.periodic and one.is_aliased else None)
     check_order(options.order, estimator)
-    check_instrument(options.instrument, estimator)
+    instrument = options.instrument or instrument_of(records)
+    check_instrument(instrument, estimator)
+    arrays = None if instrument is None else instrument.as_arrays()
     if options.order == AUTO:
-        driver = _of_least_order(seen, estimator)
+        driver = _of_least_order(seen, estimator, arrays)
     else:
-        driver = _driver(seen, options.order, estimator)
+        driver = _driver(seen, options.order, estimator, arrays)
     for one in seen if LOG.isEnabledFor(logging.INFO) else ():
         log_changes(one)
     remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
@@ -132,11 +140,6 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     if isinstance(driver, HarmonicDriver):
         unloaded = np.array([checksum(one) for one in seen])
         driver = dataclasses.replace(driver, unloaded=unloaded)
-    if options.driver_drift and isinstance(driver, ContinuousDriver):
-        driver = dataclasses.replace(driver, drift=np.asarray(options.driver_drift))
-    if options.instrument is not None:
-        assert isinstance(driver, HarmonicDriver)
-        driver = dataclasses.replace(driver, instrument=options.instrument.as_arrays())
     periods = repeats(seen)
     at = np.append(changes.bands(periods), 1e3)
     *z_th, at_1_khz = np.asarray(_response(driver, jax.device_put(at)))
@@ -164,12 +167,15 @@ def _refused(seen: Inspected, name: str | None) -> None:
         raise IdentificationError(text, None)
 
 
-def _of_least_order(seen: Sequence[Inspected], estimator: AbstractEstimator) -> Driver:
+def _of_least_order(
+    seen: Sequence[Inspected], estimator: AbstractEstimator, instrument: Instrument | None
+) -> Driver:
     """The driver of the least order that the calibrations support."""
     drivers: dict[int, HarmonicDriver] = {}
     tried: list[TriedOrder] = []
     while (order := next_order(tried)) is not None:
-        drivers[order] = serving(_driver(seen, order, estimator), HarmonicDriver, str(estimator))
+        driver = _driver(seen, order, estimator, instrument)
+        drivers[order] = serving(driver, HarmonicDriver, str(estimator))
         tried.append(_tried_order(drivers[order]))
     return dataclasses.replace(drivers[best(tried).order], tried=evidence(tried))
 
@@ -188,34 +194,65 @@ def _tried_order(driver: HarmonicDriver) -> TriedOrder:
     )
 
 
-def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
+def _driver(
+    seen: Sequence[Inspected],
+    order: int,
+    estimator: AbstractEstimator,
+    instrument: Instrument | None,
+) -> Driver:
     """The driver from calibrations that passed the pre-flight; late ones are aligned again."""
-    driver = _aligned(seen, order, estimator)
+    driver = _aligned(seen, order, estimator, instrument)
     late = np.zeros(len(seen))
     if isinstance(driver, ContinuousDriver):
         late = np.asarray(driver.calibration.delay_samples)
     if driver.verdict != "successful" and 1 < np.max(np.abs(late)) < np.inf:
         for one, delay in zip(seen, late, strict=True):
             one.lag += round(delay)
-        driver = _aligned(seen, order, estimator)
+        driver = _aligned(seen, order, estimator, instrument)
     return driver
 
 
-def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
+def _aligned(
+    seen: Sequence[Inspected],
+    order: int,
+    estimator: AbstractEstimator,
+    instrument: Instrument | None,
+) -> Driver:
     """The driver from calibrations that passed the pre-flight, aligned by their lags."""
     r_load = jax.device_put(np.asarray([one.recording.r_load for one in seen]))
-    kind = Harmonics if estimator.lane.periodic else AlignedSamples
-    lanes = [kind.of(one) for one in seen]
-    size = min(one.size for one in lanes)  # counted pulse rates may differ by one harmonic
-    records = stacked([jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes])
-    driver = _identified(records, r_load, order, estimator)
+    records = _lanes(seen, Harmonics if estimator.lane.periodic else AlignedSamples)
+    driver = _identified(records, r_load, order, estimator, instrument)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
     # elsewhere.
     if isinstance(records, Harmonics) and (may_hum(driver) or driver.verdict != "successful"):
         few = records.selected & ~mains.lines(records.frequency)
         records = dataclasses.replace(records, selected=few)
-        driver = better_of(driver, _identified(records, r_load, order, estimator))
+        driver = better_of(driver, _identified(records, r_load, order, estimator, instrument))
     return driver
+
+
+def _lanes(seen: Sequence[Inspected], kind: type[Lane]) -> Lane:
+    """The data of the calibrations, stacked."""
+    lanes = [kind.of(one) for one in seen]
+    size = min(one.size for one in lanes)  # counted pulse rates may differ by one harmonic
+    return stacked([jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes])
+
+
+@in_float64
+def with_harmonics(driver: ContinuousDriver, calibrations: Sequence[Recording]) -> HarmonicDriver:
+    """A driver of a file of fits, with the harmonics of its calibrations, which no file holds."""
+    seen = [Inspected(one) for one in calibrations]
+    for one in seen:
+        _refused(one, preflight(one, periodic=True))
+    own = {of.name: getattr(driver, of.name) for of in dataclasses.fields(ContinuousDriver)}
+    spectra = _clear(_lanes(seen, Harmonics))
+    return HarmonicDriver(**own, spectra=spectra, missing_pole=jax.device_put(np.nan))
+
+
+@program
+def _clear(records: Harmonics) -> Spectrum:
+    """The harmonics that a driver is refined with."""
+    return above_noise(records.spectrum, banded(records.spectrum))
 
 
 @program
@@ -232,7 +269,8 @@ def _identified(
     r_load: Float[Array, " record"],
     order: int,
     estimator: AbstractEstimator,
+    instrument: Instrument | None,
 ) -> Driver:
     samples = isinstance(lanes, AlignedSamples)
     records = jax.vmap(AlignedSamples.measure)(lanes) if samples else lanes
-    return estimator.fit_driver(records, r_load, order)
+    return estimator.fit_driver(records, r_load, order, instrument)

@@ -180,7 +180,6 @@ def fit_file(
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
-    driver_drift: float = 0.0,
     instrument: Instrument | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
     resume: bool = False,
@@ -200,7 +199,6 @@ def fit_file(
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
-        driver_drift: As in `identify_driver`.
         instrument: As in `identify_driver`.
         plausible: As in `identify_driver`.
         resume: Keep the parts of an earlier run that did not finish.
@@ -225,7 +223,6 @@ def fit_file(
         prior=prior,
         bounds=bounds,
         order=order if order is not None else 5 if driver is None else AUTO,
-        driver_drift=driver_drift,
         instrument=instrument,
         plausible=plausible,
     )

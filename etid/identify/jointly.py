@@ -20,7 +20,6 @@ from tqdm import tqdm
 
 from etid.estimators import judgement
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.estimator import serving
 from etid.estimators.joint.errors import Delay, Found
 from etid.estimators.joint.fit import fit_alone, fit_together
@@ -62,7 +61,7 @@ from etid.recordings.study import Study
 from etid.results.driver import HarmonicDriver, Order
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
-from etid.results.instrument import TOLERANCES, Instrument, by_tolerance
+from etid.results.instrument import ERRORS, Instrument, by_tolerance
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.results.verdicts import RESULTS, verdict, verdict_names, verdicts_of
 from etid.selection.delays import upper_limit
@@ -173,6 +172,7 @@ def _narrower(
     delays: Sequence[Delay],
     cov: Float[np.ndarray, "common common"],
     rate: float,
+    widest: float,
 ) -> float | None:
     """Width of the prior of every delay [samples] that the recordings support, if it pays.
 
@@ -182,6 +182,7 @@ def _narrower(
         delays: Their delays.
         cov: Covariance of the common parameters.
         rate: Sampling rate of the calibrations [Hz].
+        widest: Width of the prior in these fits [samples].
     """
     good = np.concatenate([_successful(fit) for fit in fits])
     if good.sum() < 2 or any(np.any(np.asarray(loads.sample_rate) != rate) for loads in groups):
@@ -190,7 +191,7 @@ def _narrower(
         np.concatenate([np.asarray(getattr(of, name)) for of in delays])[good]
         for name in ("samples", "own_variance", "slope")
     )
-    width = upper_limit(late, own, slope, cov, DELAY_WIDTH)
+    width = upper_limit(late, own, slope, cov, widest)
     errors = np.sqrt(own + np.einsum("ij,jk,ik->i", slope, cov, slope))
     return width if width < np.median(errors) else None
 
@@ -345,6 +346,7 @@ def identify_jointly(
         plausible=plausible,
     )
     drivers = Drivers(study, options)
+    _check_steady(study, instrument)
     paths = drivers.paths
     options = common_first(drivers, options)
     only = dataclasses.replace(options, circuits=(options.circuit,))
@@ -379,8 +381,11 @@ def identify_jointly(
             of_group = zip(group.rows, unstacked(judged), notes_of(judged), strict=True)
             for row, one, text in of_group:
                 fits[row], notes[row] = one, text
-    if instrument is not None:  # a fit that no driver is needed for, or that failed, has no part
-        none = np.full((len(TOLERANCES), len(only.circuit.names())), np.nan)
+    of_drivers = [of for of in drivers.found.values() if isinstance(of, HarmonicDriver)]
+    if any(
+        of.instrument is not None for of in of_drivers
+    ):  # a fit that no driver is needed for, or that failed, has no part
+        none = np.full((len(ERRORS), len(only.circuit.names())), np.nan)
         for row, fit in fits.items():
             if fit.by_tolerance is None:
                 fits[row] = dataclasses.replace(fit, by_tolerance=none)
@@ -388,6 +393,18 @@ def identify_jointly(
     outcome = table([fields_of(study, path) for path in paths], ordered, notes)
     settings = options.settings(study, len(paths), METHOD)
     return StudyFits(outcome, drivers.found, drivers.failures, settings)
+
+
+def _check_steady(study: Study, instrument: Instrument | None) -> None:
+    """Raise ValueError if an instrument says that a driver drifts."""
+    stated = [] if instrument is None else [*instrument.stored()]
+    for path in study.calibrations:
+        stated += (study.metadata(path).instrument or "").replace("=", " ").split()
+    if "drift" in stated:
+        raise ValueError(
+            "a joint fit identifies each driver together with all its recordings, so that it has "
+            "no drift between them; remove drift from the instrument, or use identify_study"
+        )
 
 
 def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit], HarmonicDriver]:
@@ -399,7 +416,8 @@ def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit]
     found, better, delays, cov = together(model, loads, several, driver)
     found, delays, cov = jax.device_get((found, delays, cov))
     small = [np.zeros(len(group.rows), bool) for group in groups]
-    width = _narrower(loads, found, delays, cov, float(driver.sample_rate))
+    widest = float(np.asarray(model.calibrations.delay_width))
+    width = _narrower(loads, found, delays, cov, float(driver.sample_rate), widest)
     if width is not None and better.verdict == "successful":
         # A start with errors of the instrument is made from the calibrations alone.
         start = better if driver.instrument is None else driver

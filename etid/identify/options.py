@@ -30,12 +30,11 @@ from etid.identify.arguments import (
     circuit_of,
     known_elements,
     order_of,
-    part_of,
     range_of,
     require,
 )
 from etid.recordings.preflight import Inspected, preflight
-from etid.recordings.recording import RecordingError
+from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import AUTO, ContinuousDriver, HarmonicDriver, Order
 from etid.results.feed import AbstractFeed, MeasuredCurrent
@@ -68,7 +67,6 @@ class Options:
         known: Elements that are known.
         bounds: Elements with bounds.
         order: Number of poles of Z_th.
-        driver_drift: As in `identify_driver`.
         instrument: As in `identify_driver`.
         plausible: As in `identify_driver`.
     """
@@ -78,7 +76,6 @@ class Options:
     known: Known = ()
     bounds: Limits = ()
     order: Order = 5
-    driver_drift: float = 0.0
     instrument: Instrument | None = None
     plausible: tuple[float, float] = PLAUSIBLE
 
@@ -92,7 +89,6 @@ class Options:
         prior: Mapping[str, tuple[float, float]] | None = None,
         bounds: Mapping[str, Interval] | None = None,
         order: Order = 5,
-        driver_drift: float = 0.0,
         instrument: Instrument | None = None,
         plausible: tuple[float, float] = PLAUSIBLE,
     ) -> "Options":
@@ -118,19 +114,12 @@ class Options:
             known=known_elements(fixed, prior),
             bounds=bounds_of(bounds),
             order=order_of(order),
-            driver_drift=part_of("driver_drift", driver_drift),
             instrument=instrument,
             plausible=range_of("plausible", plausible),
         )
         if estimator is not None:
             options.given_to(estimator)
             check_order(options.order, estimator)
-            if options.driver_drift and not issubclass(estimator.driver, ContinuousDriver):
-                raise ValueError(
-                    f"driver_drift enters standard errors, and method {str(estimator)!r} gives "
-                    "none; leave driver_drift out, or use method='maximum_likelihood' or "
-                    "method='output_error'"
-                )
             check_instrument(instrument, estimator)
         options._check_elements()
         return options
@@ -173,11 +162,9 @@ class Options:
             order=0 if self.order == AUTO else self.order,
             start=tuple(self.circuit.values().tolist()),
             candidates=tuple(type(one).__name__ for one in self.circuits if several),
-            driver_drift=self.driver_drift,
             instrument=tuple(
                 f"{name} {value!r}"
                 for name, value in (self.instrument.stored() if self.instrument else {}).items()
-                if value
             ),
             plausible=self.plausible,
             fixed=tuple(f"{name} {value!r}" for name, value, error in self.known if not error),
@@ -256,12 +243,48 @@ def check_circuits(estimator: AbstractEstimator, circuits: Sequence[AbstractCirc
 
 def check_instrument(instrument: Instrument | None, estimator: AbstractEstimator) -> None:
     """Raise ValueError if an estimator has no parameters for the tolerances of an instrument."""
-    if instrument is not None and not isinstance(estimator, MaximumLikelihood):
+    if instrument is None or isinstance(estimator, MaximumLikelihood):
+        return
+    if not issubclass(estimator.driver, ContinuousDriver):
+        raise ValueError(
+            "the tolerances of an instrument enter standard errors, and method "
+            f"{str(estimator)!r} gives none; identify the driver without instrument=, or use "
+            "method='maximum_likelihood'"
+        )
+    if instrument.states_errors:
         raise ValueError(
             "the tolerances of an instrument are parameters of maximum likelihood, and the method "
-            f"is {str(estimator)!r}; record three pulse periods or more, or identify the driver "
-            "without instrument="
+            f"is {str(estimator)!r}, which has the drift of a driver only; record three pulse "
+            "periods or more, or identify the driver without instrument="
         )
+
+
+def instrument_of(calibrations: Sequence[Recording]) -> Instrument | None:
+    """The instrument that the calibrations of a driver state; None if they state none.
+
+    Raises:
+        RecordingError: A statement cannot be read, or two of them differ.
+    """
+    first = calibrations[0]
+    for other in calibrations:
+        if other.instrument != first.instrument:
+            raise RecordingError(
+                f"is {other.instrument!r}; that of {first.path!r} is {first.instrument!r}",
+                path=other.path,
+                field="instrument",
+                remedy="State the same tolerances in all calibrations of a driver",
+            )
+    if first.instrument is None:
+        return None
+    try:
+        return Instrument.read(first.instrument)
+    except ValueError as error:
+        raise RecordingError(
+            f"is {first.instrument!r}: {error}",
+            path=first.path,
+            field="instrument",
+            remedy="Write standard deviations by name, such as 'gain=1e-3 r_load=1e-3'",
+        ) from error
 
 
 def check_order(order: Order, estimator: AbstractEstimator) -> None:

@@ -49,7 +49,7 @@ from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
-from etid.results.instrument import NARROW, TOLERANCES, Budget, Instrument, by_tolerance
+from etid.results.instrument import ERRORS, NARROW, Budget, Instrument, by_tolerance
 from etid.results.posterior import Posterior
 from etid.solvers.importance_sampling import drawn
 from etid.solvers.matrices import inverse
@@ -298,13 +298,14 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
         lane, known, _ = given(fit, recording, dataclasses.replace(driver, instrument=narrow))
         by_z = _effects(lane, known, fit.circuit)
         errors = narrow.deviations(driver.calibration.r_load.size).size
-        of = by_tolerance(by_z[-errors:])
+        of = dict(zip(ERRORS, np.asarray(by_tolerance(by_z[-errors:])), strict=True))
+        later = np.asarray(by_z)[-errors - driver.cov.shape[0] : -errors]
+        of["drift"] = np.sqrt(np.sum(later**2, axis=0))
     else:
-        of = fit.by_tolerance
-    of = dict(zip(TOLERANCES, np.asarray(of), strict=True))
+        of = dict(zip(ERRORS, np.asarray(fit.by_tolerance), strict=True))
     values = np.asarray(fit.circuit.values())
     cov, shared = (np.diagonal(np.asarray(of)) / values**2 for of in (fit.cov, fit.shared_cov))
-    instrument = {name: of[name] for name, size in stated.items() if size}
+    instrument = {name: of[name] for name in stated if name in of}
     rest = shared - sum(part**2 for part in instrument.values())
     return Budget(
         names=fit.circuit.names(),
@@ -313,6 +314,6 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
             "driver": np.sqrt(np.maximum(rest, 0.0)),
             **instrument,
         },
-        tolerances={name: size for name, size in stated.items() if size},
-        unstated={name: of[name] / NARROW for name, size in stated.items() if not size},
+        tolerances=stated,
+        unstated={name: part / NARROW for name, part in of.items() if name not in stated},
     )

@@ -44,7 +44,6 @@ def identify_study(
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
-    driver_drift: float = 0.0,
     instrument: Instrument | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
     progress: bool = False,
@@ -63,7 +62,6 @@ def identify_study(
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
-        driver_drift: As in `identify_driver`.
         instrument: As in `identify_driver`.
         plausible: As in `identify_driver`.
         progress: Show a progress bar.
@@ -82,7 +80,6 @@ def identify_study(
         prior=prior,
         bounds=bounds,
         order=order,
-        driver_drift=driver_drift,
         instrument=instrument,
         plausible=plausible,
     )

@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.estimate import delay_width
 from etid.estimators.lanes import Harmonics
 from etid.numpy_tier.tiers import program
 from etid.results.driver import ContinuousDriver, SourceImpedance
@@ -109,6 +109,9 @@ def _source(
     return z_th(values), jax.jacfwd(z_th)(values).T
 
 
+_delay_width = program(delay_width)
+
+
 def _fitted(
     lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
 ) -> tuple[
@@ -128,7 +131,9 @@ def _fitted(
         source, slopes = map(np.asarray, _source(feed.source, frequency))
         size, vectors = np.linalg.eigh(np.asarray(feed.later_cov()))
         changes = (vectors * np.sqrt(np.maximum(size, 0.0))).T @ slopes
-    deviations = np.append(DELAY_WIDTH, np.ones(len(changes)))
+    instrument = None if isinstance(feed, MeasuredCurrent) else feed.instrument
+    width = np.asarray(_delay_width(instrument, jax.device_put(np.asarray(lane.sample_rate))))
+    deviations = np.append(width, np.ones(len(changes)))
 
     def at(p: Float[np.ndarray, " parameter"]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         z_th = None if source is None else source + p[1:] @ changes

@@ -277,6 +277,13 @@ class AbstractFields:
         "samples at these limits are saturated.",
         example=[-186.9, 186.9],
     )
+    instrument: str | None = _field(
+        "text",
+        forbidden="loaded",
+        description="Tolerances of the instrument: standard deviations by name, as in "
+        "`etid.Instrument`. All calibrations of a driver state the same.",
+        example="gain=1e-3 r_load=1e-3",
+    )
 
 
 DECLARED: dict[str, Field] = {
@@ -314,6 +321,7 @@ class Given(TypedDict, total=False):
     trial: Label | None
     calibration: str | Sequence[str] | None
     adc_range: Sequence[Number] | None
+    instrument: str | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -69,11 +69,11 @@ def _facts(
     """What `templates/methods.txt` makes sentences of."""
     fits, settings, drivers = found.fits, found.settings, list(found.drivers.values())
     recordings = "recording" if len(fits) == 1 else f"{len(fits)} recordings"
-    candidates, typical, instrument = "", "", ()
+    candidates, typical = "", ""
     if settings is not None:
         if settings.source:
             recordings += f" of {pathlib.Path(settings.source).name}"
-        candidates, instrument = ", ".join(sorted(settings.candidates)), settings.instrument
+        candidates = ", ".join(sorted(settings.candidates))
         units = fits.circuit.units().items()
         typical = ", ".join(
             f"{name} {quantity(value, unit)}"
@@ -103,10 +103,19 @@ def _facts(
         "orders": sorted({driver.order for driver in drivers}),
         "continuous": bool(continuous),
         "resistors": f"{resistors} kΩ" if resistors else "",
-        "r_load_uncertain": any(one.startswith("r_load") for one in instrument),
+        "instrument": _instrument(found),
+        "r_load_uncertain": "r_load" in _instrument(found),
         "conditions": list(dict.fromkeys(c for one in used for c in one.conditions)),
         "of_driver": list(dict.fromkeys(c for one in of_drivers for c in one.of_driver)),
     }
+
+
+def _instrument(found: StudyFits) -> str:
+    """What the drivers state of the instrument."""
+    drivers = [one for one in found.drivers.values() if isinstance(one, ContinuousDriver)]
+    told = [one.instrument.stored() for one in drivers if one.instrument is not None]
+    stated = (f"{name} {value:g}" for of in told for name, value in of.items())
+    return ", ".join(dict.fromkeys(stated))
 
 
 def words(method: str) -> str:
@@ -137,9 +146,9 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         "recordings": source,
         "method": f"asked for {settings.asked_method or 'none'}, used {found.fits.fit.method}",
         "circuit": circuit,
-        "Z_th": f"{driver}order {settings.order or 'auto'}, drift of "
-        f"{100 * settings.driver_drift:g} %, accepted from {low:g} to {high:g} ohm at 1 kHz",
-        "tolerances of the instrument": ", ".join(settings.instrument) or "none",
+        "Z_th": f"{driver}order {settings.order or 'auto'}, accepted from {low:g} to {high:g} ohm "
+        "at 1 kHz",
+        "tolerances of the instrument": _instrument(found) or "none",
         "known elements": ", ".join(settings.fixed + settings.prior + settings.bounds) or "none",
         "computed": f"in {settings.precision} on {settings.backend}",
         "versions": ", ".join(settings.versions),

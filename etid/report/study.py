@@ -19,6 +19,7 @@ from etid.recordings.fields import DESCRIBING
 from etid.recordings.study import Study
 from etid.report import figures
 from etid.report import tables as study_tables
+from etid.report.budget import budgets
 from etid.report.html import Picture, Section, write_page
 from etid.report.methods import methods_section, succeeded, words
 from etid.report.waveforms import find, relative_stderr, waveforms
@@ -40,8 +41,8 @@ def write_report(
     """Write a report on the fits of a study: one HTML page that needs no other file.
 
     The report shows the verdicts and the drivers. It separates the variation between subjects and
-    recordings from the errors. It has tables, distributions, the worst fits with their waveforms,
-    and a methods section with BibTeX.
+    recordings from the errors. It has tables, distributions, the budget of a typical recording, the
+    worst fits with their waveforms, and a methods section with BibTeX.
 
     Args:
         fits: File of fits, or the result of an identification.
@@ -73,12 +74,18 @@ def write_report(
             raise ValueError(f"{page} would replace a file that is read; name another page")
     study, problem = find(found, file, recordings)
     try:
-        drawn = waveforms(found, study, problem)
+        drawn, budget = waveforms(found, study, problem), budgets(found, study)
     finally:
         if study is not None and study is not recordings:
             study.close()
     if len(found.fits) == 1:
-        sections = [_single(found.fits), drawn, _drivers(found), methods_section(found)]
+        sections = [
+            _single(found.fits),
+            drawn,
+            *budget,
+            _drivers(found),
+            methods_section(found),
+        ]
     else:
         groups = found.fits.summary("subject", "condition")
         sections = [
@@ -88,6 +95,7 @@ def write_report(
             _subjects(found.fits, groups),
             *_electrodes(found.fits, layout),
             _quality(found.fits),
+            *budget,
             _recordings(found.fits, drawn),
             drawn,
             methods_section(found),

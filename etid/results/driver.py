@@ -235,9 +235,6 @@ class ContinuousDriver(Driver):
         source: Continuous Z_th, valid at any sample rate.
         cov: Covariance of the parameters of `source`, flattened in field order.
         calibration: Results of the calibrations that skins need.
-        drift: Relative standard deviation of the change of each parameter of `source` between the
-            calibration and the recording of a skin; None if there is no change. `cov` does not
-            contain it.
         instrument: Tolerances of the instrument; None if it has none. `cov` does not contain them.
         tried: Orders that `order="auto"` tried; none if the user chose the order.
         start: Which start of Z_th led here, from 0 on: three generic ones, and one with the
@@ -248,10 +245,17 @@ class ContinuousDriver(Driver):
     source: SourceImpedance
     cov: Float[Array, "parameter parameter"]
     calibration: Calibration
-    drift: Float[Array | np.ndarray, ""] | None = None
     instrument: Instrument | None = None
     tried: OrderEvidence = eqx.field(default_factory=OrderEvidence.none)
     start: Int[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: np.array(0))
+
+    @property
+    def drift(self) -> Float[Array | np.ndarray, ""] | None:
+        """Relative standard deviation of the change of each parameter of `source` until a skin.
+
+        None if there is no change. `cov` does not contain it.
+        """
+        return None if self.instrument is None else self.instrument.drift
 
     def drift_std(self) -> Float[Array, " parameter"]:
         """Standard deviations of the parameters of `source` that come from `drift` alone."""

@@ -14,13 +14,18 @@ from etid.circuits.overview import Overview, Overviewed
 _Number = float | Float[Array | np.ndarray, ""]
 _Kind = TypeVar("_Kind", bound="Instrument")
 
-# Largest possible value of each tolerance, above which it has a wrong unit; and the value for which
-# a budget shows the effect of an error that nobody stated [relative, F].
+# Errors that a fit estimates with the elements. The value is that for which a budget shows the
+# effect of an error that nobody stated [relative, F].
+ERRORS = {"gain": 1e-3, "r_load": 1e-3, "crosstalk": 1e-3, "capacitance": 1e-12}
+BUDGETED = ERRORS | {"drift": 1e-2}
+# Value of each tolerance from which on it has a wrong unit, and the unit.
 TOLERANCES = {
-    "gain": (1.0, 1e-3),
-    "r_load": (1.0, 1e-3),
-    "crosstalk": (1.0, 1e-3),
-    "capacitance": (1e-7, 1e-12),
+    "gain": (1.0, "relative"),
+    "r_load": (1.0, "relative"),
+    "crosstalk": (1.0, "relative"),
+    "capacitance": (1e-7, "F"),
+    "drift": (1.0, "relative"),
+    "delay": (1e-3, "s"),
 }
 NARROW = 1e-3  # of a tolerance that nobody stated: a prior that no recording changes
 
@@ -38,22 +43,48 @@ class Instrument(eqx.Module):
         r_load: Of each known resistor [relative].
         crosstalk: Of the part of V_th that V_out shows in all recordings [relative].
         capacitance: Of a capacitance across the skin that the calibrations did not have [F].
+        drift: Of the change of each parameter of Z_th between calibration and skin [relative].
+        delay: Of the delay of each V_out after its V_th [s]; None leaves the delays open.
     """
 
     gain: _Number = 0.0
     r_load: _Number = 0.0
     crosstalk: _Number = 0.0
     capacitance: _Number = 0.0
+    drift: _Number | None = 0.0
+    delay: _Number | None = None
 
     def __check_init__(self) -> None:
-        for name, (largest, _) in TOLERANCES.items():
+        for name, (largest, unit) in TOLERANCES.items():
             value = getattr(self, name)
             if isinstance(value, int | float) and not 0 <= value < largest:
-                unit = "F" if name == "capacitance" else "relative to the value"
                 raise ValueError(
                     f"{name} of an instrument is {value!r}; it is a standard deviation [{unit}], "
                     f"at least 0 and below {largest:g}"
                 )
+
+    @classmethod
+    def read(cls: type[_Kind], text: str) -> _Kind:
+        """The instrument of a text such as `"gain=1e-3 drift=0.01"`.
+
+        Raises:
+            ValueError: A part is no `name=number`, or a name is not known or stands twice.
+        """
+        found: dict[str, float] = {}
+        for part in text.split():
+            name, _, number = part.partition("=")
+            if name not in TOLERANCES or name in found:
+                raise ValueError(f"{part!r} is none of {', '.join(TOLERANCES)}, each at most once")
+            try:
+                found[name] = float(number)
+            except ValueError:
+                raise ValueError(f"{part!r} is no number; write {name}=1e-3") from None
+        return cls(**found)
+
+    @property
+    def states_errors(self) -> bool:
+        """Whether more than a drift is stated: what only maximum likelihood has."""
+        return bool(self.stored().keys() - {"drift"})
 
     def deviations(self, resistors: int) -> Float[Array, " error"]:
         """Standard deviations of gain, crosstalk, capacitance, and of each known resistor."""
@@ -62,21 +93,25 @@ class Instrument(eqx.Module):
 
     def narrow(self: _Kind) -> _Kind:
         """The same with a small deviation for each tolerance that nobody stated, for a budget."""
-        told = self.stored()
-        narrow = {name: told[name] or NARROW * size for name, (_, size) in TOLERANCES.items()}
-        return type(self)(**narrow).as_arrays()
+        narrow = {name: NARROW * size for name, size in BUDGETED.items()}
+        return type(self)(**(narrow | self.stored())).as_arrays()
 
     def stored(self) -> dict[str, float]:
-        """The numbers by name."""
-        return {name: float(getattr(self, name)) for name in TOLERANCES}
+        """The tolerances that are stated, by name."""
+        told = {name: getattr(self, name) for name in TOLERANCES}
+        return {name: float(of) for name, of in told.items() if of is not None and of != 0}
 
     def as_arrays(self: _Kind) -> _Kind:
-        """The same with arrays, which a traced program takes as operands."""
-        return type(self)(**{name: np.asarray(value) for name, value in self.stored().items()})
+        """The same with arrays, which a traced program takes as operands; None without a drift."""
+        none = dict.fromkeys(ERRORS, 0.0) | {"drift": None}
+        told = none | self.stored()
+        return type(self)(
+            **{name: of if of is None else np.asarray(of) for name, of in told.items()}
+        )
 
 
 def by_tolerance(effects: Float[Array, "error element"]) -> Float[Array, "tolerance element"]:
-    """Size of the effect of each of `TOLERANCES`; the errors are those of `deviations`."""
+    """Size of the effect of each of `ERRORS`; the errors are those of `deviations`."""
     gain, crosstalk, capacitance = jnp.abs(effects[:3])
     r_load = jnp.sqrt(jnp.sum(effects[3:] ** 2, axis=0))  # the resistors are independent
     return jnp.stack([gain, r_load, crosstalk, capacitance])
@@ -100,7 +135,7 @@ class Budget(Overviewed):
             of the instrument.
         tolerances: The stated tolerances [relative, F].
         unstated: Size of the change of each element by an error of the instrument that nobody
-            stated, of the size in `TOLERANCES`.
+            stated, of the size in `BUDGETED`.
     """
 
     names: tuple[str, ...]
@@ -120,6 +155,6 @@ class Budget(Overviewed):
             shown[source if size is None else _named(source, size)] = part
         shown["together"] = self.together
         for source, change in self.unstated.items():
-            shown[f"if {_named(source, TOLERANCES[source][1])}"] = change
+            shown[f"if {_named(source, BUDGETED[source])}"] = change
         rows = [(name, *(f"± {100 * of:.2g} %" for of in part)) for name, part in shown.items()]
         return Overview("Budget of the standard errors", rows, ("", *self.names))

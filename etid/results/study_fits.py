@@ -58,7 +58,6 @@ class Settings:
         start: Typical values of the elements [SI]; fits start around them.
         candidates: Names of the circuits from which that of all recordings was chosen; empty if
             the user chose it.
-        driver_drift: As in `identify_driver`.
         fixed: Known elements and their values [SI], such as `"r_s 500.0"`.
         prior: Elements with a prior, values and standard deviations [SI], such as
             `"r_s 500.0 ± 50.0"`.
@@ -80,7 +79,6 @@ class Settings:
     order: int
     start: tuple[float, ...]
     candidates: tuple[str, ...]
-    driver_drift: float
     fixed: tuple[str, ...]
     prior: tuple[str, ...]
     bounds: tuple[str, ...]
@@ -230,10 +228,11 @@ def _settings(table: Table) -> Settings | None:
                 remedy=REMEDY,
             )
         values[name] = tuple(items) if several else value
-    if "r_load_tolerance" in table.attributes:  # earlier versions stored this tolerance apart
-        part = table.attribute("r_load_tolerance")
+    # Earlier versions stored these tolerances apart.
+    for name, former in (("r_load", "r_load_tolerance"), ("drift", "driver_drift")):
+        part = table.attribute(former) if former in table.attributes else 0.0
         if isinstance(part, float) and part > 0:
-            values["instrument"] = (*values.get("instrument", ()), f"r_load {part!r}")
+            values["instrument"] = (*values.get("instrument", ()), f"{name} {part!r}")
     return Settings(**values)
 
 
@@ -273,7 +272,7 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
     }
     if isinstance(driver, ContinuousDriver):
         stored |= {
-            **_lists(driver, "drift", "cov"),
+            **_lists(driver, "cov"),
             **_lists(driver.calibration, "r_load", "delay_samples", "delay_std_samples"),
             "instrument": None if driver.instrument is None else driver.instrument.stored(),
             "source": _lists(driver.source),
@@ -307,7 +306,7 @@ def _from_json(stored: Mapping[str, Any]) -> Driver:
 def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
     """`ContinuousDriver` with the fields that a discrete driver does not have.
 
-    Files of earlier versions have no instrument and no orders that were tried.
+    Files of earlier versions have no instrument and no orders that were tried, and a drift apart.
     """
     own = stored["source"]
     pairs = _numbers(own, "log_omega", None).size
@@ -320,9 +319,11 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
     size = 1 + 4 * pairs + 2 * reals
     r_load = _numbers(stored, "r_load", None)
     delays = _numbers(stored, "delay_samples", r_load.size), _numbers(stored, "delay_std_samples")
-    instrument, tried = stored.get("instrument"), OrderEvidence.none()
-    if instrument is not None:
-        numbers = {name: float(_numbers(instrument, name)) for name in TOLERANCES}
+    told, instrument, tried = stored.get("instrument"), None, OrderEvidence.none()
+    numbers = {name: float(_numbers(told, name)) for name in TOLERANCES if name in (told or ())}
+    if stored.get("drift") is not None:
+        numbers["drift"] = float(_numbers(stored, "drift"))
+    if told is not None or numbers:
         instrument = Instrument(**numbers).as_arrays()
     if "tried" in stored:
         of, orders = stored["tried"], tried.bic.size
@@ -338,7 +339,6 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
         source=source,
         cov=_numbers(stored, "cov", size, size),
         calibration=Calibration(r_load, *delays),
-        drift=None if stored.get("drift") is None else _numbers(stored, "drift"),
         instrument=instrument,
         tried=tried,
     )

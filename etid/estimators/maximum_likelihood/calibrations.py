@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
-from etid.estimators.estimate import DELAY_WIDTH, prior
+from etid.estimators.estimate import DELAY_WIDTH, delay_width, prior
 from etid.estimators.maximum_likelihood.condensed import Condensed, Near, Slopes, apart, means
 from etid.estimators.maximum_likelihood.profile import Profile, Records, excess, total
 from etid.estimators.sandwich import Linear
@@ -57,7 +57,8 @@ class Calibrations(eqx.Module):
     def of(cls, driver: HarmonicDriver) -> "Calibrations":
         """The calibrations of an identified driver."""
         rate = jnp.asarray(driver.sample_rate)
-        of = driver.source, driver.calibration, driver.spectra, rate
+        width = delay_width(driver.instrument, rate)
+        of = driver.source, driver.calibration, driver.spectra, rate, width
         return cls(*of, instrument=driver.instrument)
 
     @property

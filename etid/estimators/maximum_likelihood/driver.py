@@ -18,6 +18,7 @@ from etid.estimators.estimate import (
     SOLVER,
     Estimate,
     delay_std,
+    delay_width,
 )
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.condensed import Condensed, Near, apart
@@ -25,6 +26,7 @@ from etid.estimators.maximum_likelihood.profile import Profile, Records, total
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, SourceImpedance
+from etid.results.instrument import Instrument
 from etid.signals.harmonics import Spectrum, as_list
 from etid.signals.transfer import as_complex
 from etid.solvers import least_squares, successive
@@ -175,10 +177,12 @@ def fit_source(
     r_load: Float[Array, " record"],
     sample_rate: Float[Array, ""],
     candidates: Rough,
+    instrument: Instrument | None = None,
 ) -> tuple[Calibrations, Estimate, Near, Linear]:
     """Identify Z_th from one or several records with known resistors, stacked.
 
-    The best start is the first; the others are tried only if it does not converge.
+    The best start is the first; the others are tried only if it does not converge. Of the
+    instrument only the delays matter, because its errors are 0 at the minimum.
 
     Returns:
         The calibrations with Z_th and their delays; the estimate, with parameters in the order of
@@ -186,7 +190,8 @@ def fit_source(
     """
     best = jax.tree.map(lambda leaf: leaf[0], candidates)
     calibration = Calibration(r_load, best.delay_samples, delay_std(r_load))
-    model = Calibrations(best.source, calibration, spectra, sample_rate)
+    width = delay_width(instrument, sample_rate)
+    model = Calibrations(best.source, calibration, spectra, sample_rate, width)
 
     def fit(tried: _Tried) -> _Tried:
         start = jax.tree.map(lambda leaf: leaf[tried.count], candidates)
@@ -235,5 +240,5 @@ def fit_source(
         hum=jnp.stack([profile.shows_hum(records) for records, profile in each]).any(),
     )
     calibration = dataclasses.replace(calibration, delay_samples=found.delay_samples)
-    calibrations = Calibrations(model.source_of(q), calibration, spectra, sample_rate)
+    calibrations = Calibrations(model.source_of(q), calibration, spectra, sample_rate, width)
     return calibrations, estimate, near, linear

@@ -29,6 +29,7 @@ from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
+from etid.results.instrument import Instrument
 
 
 def description(words: str, estimated: str, unknowns: str, tests: tuple[str, ...]) -> Description:
@@ -103,9 +104,10 @@ class MaximumLikelihood(AbstractEstimator):
         records: Harmonics,
         r_load: Float[Array, " record"],
         order: int,
+        instrument: Instrument | None,
     ) -> Driver:
         """Identify a driver: Z_th and the trigger delays of its calibrations."""
-        return from_harmonics(records, r_load, order, str(self))
+        return from_harmonics(records, r_load, order, str(self), instrument)
 
     def known(
         self,

@@ -146,13 +146,15 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     )
     wrong = other.seen() | other.has_other_gain() | falling.seen()
     contradicts = of_scales.contradicts()[1:].any()
+    width = load.gains.widths(at)[count]  # of the prior of the delay of V_out
+    contradicts |= beyond(late[0] / width, information[count, count] / width**2)
     if driver.faults is not None:
         tolerated = jnp.any(driver.faults[1] != 0, axis=1)
         contradicts |= beyond(jnp.where(tolerated, z, 0.0), jnp.diagonal(information)[owned:])
     return Found(estimate, moved > FAR, wrong, contradicts)
 
 
-def beyond(z: Float[Array, " error"], variance: Float[Array, " error"]) -> Bool[Array, ""]:
+def beyond(z: Float[Array, "*error"], variance: Float[Array, "*error"]) -> Bool[Array, ""]:
     """Whether an error of the instrument, in its standard deviations, contradicts its tolerance."""
     left = 1 - variance  # the prior of an error and the data differ by N(0, 1 − its variance)
     return jnp.any(z**2 > SEEN**2 * jnp.where(left > UNSEEN, left, jnp.inf))

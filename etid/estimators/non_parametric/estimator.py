@@ -26,6 +26,7 @@ from etid.estimators.starts import harmonic_starts
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
+from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS
 
 SAME_PULSE_RATE = 1e-3  # relative difference of pulse rates that is allowed, as Z_th is smooth
@@ -52,9 +53,15 @@ class NonParametric(AbstractEstimator):
                 f"{pulse_rate:.6g} Hz; use method='maximum_likelihood'"
             )
 
-    def fit_driver(self, records: Harmonics, r_load: Float[Array, " record"], order: int) -> Driver:
+    def fit_driver(
+        self,
+        records: Harmonics,
+        r_load: Float[Array, " record"],
+        order: int,
+        instrument: Instrument | None,
+    ) -> Driver:
         """Identify a driver by maximum likelihood, which keeps its harmonics."""
-        return from_harmonics(records, r_load, order, "maximum_likelihood")
+        return from_harmonics(records, r_load, order, "maximum_likelihood", instrument)
 
     def known(
         self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool

@@ -25,6 +25,7 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
+from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS
 from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational
@@ -80,9 +81,10 @@ class OutputError(AbstractEstimator):
         records: Measurement,
         r_load: Float[Array, " record"],
         order: int,
+        instrument: Instrument | None,
     ) -> Driver:
         """Identify a driver: Z_th in continuous time."""
-        return from_samples(records, r_load, order, str(self))
+        return from_samples(records, r_load, order, str(self), instrument)
 
     def fit_load(
         self,

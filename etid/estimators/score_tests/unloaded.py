@@ -30,8 +30,8 @@ FIRST = 6  # first harmonics, which are not used because of hum and drift
 SIGNAL = 0.9  # smallest share of signal in the power around a harmonic that is used
 SEEN = 37.37  # χ² that all directions exceed by chance in `FALSE_ALARMS`
 SIZE = 1.5e-4  # smallest difference relative to V_th; pulses repeat no better than this
-# Additional difference for a driver with a known drift, relative to the drift. It is three times
-# the standard deviation of an inductance, which has the largest effect.
+# Difference that the drift of a driver makes, relative to the drift. It is three times the standard
+# deviation by an inductance, which has the largest effect.
 DRIFT = 0.2
 OTHER = 0.1  # difference relative to V_th of another pulse; doubling a part has less effect
 SMOOTH = 1 / 3  # part of the difference that must be smooth
@@ -51,7 +51,7 @@ class UnloadedShape(NamedTuple):
             delay; first the real parts, then the imaginary parts.
         bias: Bias along each direction [V]. It arises because the directions contain the noise of
             `x` too.
-        least: Smallest difference that counts, relative to V_th.
+        drift: Difference that the drift of the driver makes, relative to V_th.
     """
 
     frequency: Float[Array, " harmonic"]
@@ -59,7 +59,7 @@ class UnloadedShape(NamedTuple):
     variance: Float[Array, " harmonic"]
     directions: Float[Array, "direction part"]
     bias: Float[Array, " direction"]
-    least: Float[Array, ""]
+    drift: Float[Array, ""]
 
     def differs(self, spectrum: Spectrum) -> Bool[Array, ""]:
         """Whether the unloaded voltage of a recording shows that the driver has changed."""
@@ -80,18 +80,21 @@ class UnloadedShape(NamedTuple):
         part = jnp.concatenate([rest.real, rest.imag])
         along = self.directions @ part + amplitude * scale * self.bias
         smooth, all_of_it = jnp.sum(along**2), jnp.sum(part**2)
-        size = jnp.sqrt(smooth / total) / (scale * jnp.abs(amplitude))
+        level = scale * jnp.abs(amplitude) * jnp.sqrt(total)  # of V_th [standard deviations]
+        size = jnp.sqrt(smooth) / level
         same = jnp.abs(spectrum.frequency[0] / self.frequency[0] - 1) < SAME_FREQUENCY
         of_chance = 2 * jnp.sum(known != 0, dtype=part.dtype)
-        large = (size > self.least) & (size < OTHER) & (smooth > SMOOTH * (all_of_it - of_chance))
+        large = (size > SIZE) & (size < OTHER) & (smooth > SMOOTH * (all_of_it - of_chance))
+
+        beyond = jnp.maximum(1 - self.drift / size, 0.0)  # part that no stated drift explains
 
         def in_its_noise(_) -> Bool[Array, ""]:
             noise = excess(part - along @ self.directions, known != 0)
-            return jnp.sum(along**2 / (self.directions**2 @ noise)) > SEEN
+            return jnp.sum((beyond * along) ** 2 / (self.directions**2 @ noise)) > SEEN
 
         # The noise is at least 1, so a sum below `SEEN` needs no estimate of the noise.
         another = all_of_it > of_chance / 2  # otherwise both are the same record
-        seen = same & large & another & (smooth > SEEN)
+        seen = same & large & another & (beyond**2 * smooth > SEEN)
         return jax.lax.cond(seen, in_its_noise, lambda _: jnp.array(False), None)
 
 
@@ -111,8 +114,8 @@ def shape(spectrum: Spectrum, drift: Float[Array | np.ndarray, ""] | None = None
     # Σ Re (q/x)* σ²: a direction q is x times a function of frequency; the difference contains −x.
     share = jnp.where(used, spectrum.variance_x / jnp.where(used, power(x), 1.0), 0.0)
     bias = directions @ (jnp.concatenate([x.real, x.imag]) * jnp.tile(share, 2))
-    least = jnp.asarray(SIZE) + DRIFT * (0.0 if drift is None else drift)
-    return UnloadedShape(f, x, spectrum.variance_x, directions, bias, least)
+    made = jnp.asarray(DRIFT * (0.0 if drift is None else drift))
+    return UnloadedShape(f, x, spectrum.variance_x, directions, bias, made)
 
 
 def shape_of(driver: Driver, frequency: Float[Array, " harmonic"]) -> UnloadedShape | None:

@@ -18,6 +18,7 @@ from etid.estimators.lanes import AlignedSamples
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.results.driver import DiscreteDriver, Driver
 from etid.results.fit import Fit
+from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational
@@ -66,8 +67,10 @@ class SteiglitzMcBride(AbstractEstimator):
         records: Measurement,
         r_load: Float[Array, " record"],
         order: int,
+        instrument: Instrument | None,
     ) -> Driver:
         """The paper's estimate of Z_th (eqs. 4-6)."""
+        del instrument
         best = iteration.driver_filter(records.v_th, records.v_out, r_load, order, self.iterations)
 
         def score(m: Measurement, r: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:

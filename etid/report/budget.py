@@ -1,0 +1,55 @@
+"""The uncertainty budget of a typical recording: what to buy or to record next."""
+
+import numpy as np
+
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
+from etid.identify.driver import with_harmonics
+from etid.recordings.recording import RecordingError
+from etid.recordings.study import Study
+from etid.report.html import Section, Table
+from etid.report.waveforms import relative_stderr
+from etid.results.driver import ContinuousDriver, HarmonicDriver
+from etid.results.fit import IdentificationError
+from etid.results.instrument import Budget
+from etid.results.study_fits import StudyFits
+
+
+def budgets(found: StudyFits, study: Study | None) -> list[Section]:
+    """The budget of the fit whose standard errors are the median; none without its recording.
+
+    Fits by other methods than maximum likelihood, and joint fits in a file, have none.
+    """
+    errors = relative_stderr(found.fits)
+    errors[np.asarray(found.fits.verdicts) != "successful"] = np.nan
+    rows = np.argsort(errors)[: np.sum(np.isfinite(errors))]
+    if study is None or not rows.size or found.fits.fit.method != str(MAXIMUM_LIKELIHOOD):
+        return []
+    row = int(rows[(rows.size - 1) // 2])
+    path = str(found.fits.labels["path"][row])
+    try:
+        budget = _of(found, study, row, path)
+    except (RecordingError, IdentificationError, KeyError, ValueError):
+        return []
+    if budget is None:
+        return []
+    typical = "" if rows.size == 1 else f" of {path}, whose errors are the median of all"
+    text = (
+        f"What each source adds to the standard errors{typical}. More periods reduce the noise of "
+        "the recording, and a longer calibration or a second resistor the error of the driver. "
+        "What stands behind “if” was not stated: such an error of the instrument would change the "
+        "elements by this size, and is in no standard error."
+    )
+    overview = budget._overview()
+    return [Section("Budget", text, (Table(("source", *budget.names), tuple(overview.rows)),))]
+
+
+def _of(found: StudyFits, study: Study, row: int, path: str) -> Budget | None:
+    """The budget of a fit; None if its driver is no longer known."""
+    recording = study[path]
+    names = recording.calibration or tuple(study.calibrations)
+    driver = found.drivers.get(names)
+    if not isinstance(driver, HarmonicDriver):
+        if not isinstance(driver, ContinuousDriver):
+            return None
+        driver = with_harmonics(driver, [study[name] for name in names])
+    return found.fits[row].budget(recording, driver)
