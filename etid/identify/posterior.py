@@ -49,7 +49,7 @@ from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
-from etid.results.instrument import ERRORS, NARROW, Budget, Instrument, by_tolerance
+from etid.results.instrument import BUDGETED, ERRORS, NARROW, Budget, Instrument, by_tolerance
 from etid.results.posterior import Posterior
 from etid.solvers.importance_sampling import drawn
 from etid.solvers.matrices import inverse
@@ -265,8 +265,10 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
 
 
 @program
-def _effects(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Float[Array, "z element"]:
-    """Change of the logarithms of the elements by each z, whose prior is standard normal.
+def _effects(
+    lane: Harmonics, known: Known, circuit: AbstractCircuit, driver: HarmonicDriver
+) -> Float[Array, "tolerance element"]:
+    """Changes of the logarithms of the elements by `BUDGETED`, whose priors are standard normal.
 
     It is the column of z in H⁻¹ (`etid.estimators.sandwich`).
     """
@@ -274,7 +276,12 @@ def _effects(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Float[A
     gains = load.gains
     start = [circuit.log_values(), jnp.zeros(gains.outputs), known.driver.mean]
     found = least(load, jnp.concatenate(start))[1]
-    return load_fit.covariance_of_priors(load, found)[gains.owned :, : gains.elements]
+    by_z = load_fit.covariance_of_priors(load, found)[gains.owned :, : gains.elements]
+    assert driver.instrument is not None
+    errors = len(by_z) - driver.instrument.deviations(driver.calibration.r_load.size).size
+    later = by_z[errors - len(driver.cov) : errors]
+    drift = jnp.sqrt(jnp.sum(later**2, axis=0))
+    return jnp.concatenate([by_tolerance(by_z[errors:]), drift[None]])
 
 
 @in_float64
@@ -294,13 +301,11 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
             "with the tolerances that you know; files of fits keep none"
         )
     if fit.by_tolerance is None:
-        narrow = told.narrow()
-        lane, known, _ = given(fit, recording, dataclasses.replace(driver, instrument=narrow))
-        by_z = _effects(lane, known, fit.circuit)
-        errors = narrow.deviations(driver.calibration.r_load.size).size
-        of = dict(zip(ERRORS, np.asarray(by_tolerance(by_z[-errors:])), strict=True))
-        later = np.asarray(by_z)[-errors - driver.cov.shape[0] : -errors]
-        of["drift"] = np.sqrt(np.sum(later**2, axis=0))
+        driver = dataclasses.replace(driver, instrument=told.narrow())
+        lane, known, _ = given(fit, recording, driver)
+        of = dict(
+            zip(BUDGETED, np.asarray(_effects(lane, known, fit.circuit, driver)), strict=True)
+        )
     else:
         of = dict(zip(ERRORS, np.asarray(fit.by_tolerance), strict=True))
     values = np.asarray(fit.circuit.values())

@@ -85,7 +85,6 @@ class UnloadedShape(NamedTuple):
         same = jnp.abs(spectrum.frequency[0] / self.frequency[0] - 1) < SAME_FREQUENCY
         of_chance = 2 * jnp.sum(known != 0, dtype=part.dtype)
         large = (size > SIZE) & (size < OTHER) & (smooth > SMOOTH * (all_of_it - of_chance))
-
         beyond = jnp.maximum(1 - self.drift / size, 0.0)  # part that no stated drift explains
 
         def in_its_noise(_) -> Bool[Array, ""]:
