@@ -1,11 +1,14 @@
 """By how many standard deviations the best test could see a change of the records.
 
 The records are those of `etid.simulation.bound`: X_k and Z_th(f_k) are unknown at every harmonic,
-and so are the elements and the delays. A change adds ε ∂Y_k to the loaded voltages, ε = 1 for the
-change itself. What of it those unknowns cannot imitate, over the noise, is the largest number of
-standard deviations by which any test without a bias can see it. By the lemma of Neyman and Pearson
-(1933), the test that refuses beyond `LIMIT` of them is the most powerful one with its rate of false
-alarms. `missed` is the probability that it does not refuse.
+and so are the elements and the delays. The best test knows that the unloaded voltages of both
+records are one pulse, with an amplitude and a delay of each. A change adds ε ∂Y_k to the loaded
+voltages, ε = 1 for the change itself. What of it those unknowns cannot imitate, over the noise, is
+the largest number of standard deviations by which any test without a bias can see it. By the lemma
+of Neyman and Pearson (1933), the test that refuses beyond `LIMIT` of them is the most powerful one
+with its rate of false alarms. `missed` is the probability that it does not refuse. The fits of etid
+do not use that the pulses are one: it would double their time for bounds that are 10 to 17 %
+smaller.
 """
 
 import math
@@ -71,11 +74,12 @@ def shunt(c: float) -> Change:
 
 
 def information(
-    load: SkinLoad, snr_db: float, band: float, *changes: Change
+    load: SkinLoad, snr_db: float, band: float, *changes: Change, one_pulse: bool = False
 ) -> Float[np.ndarray, "q q"]:
     """Fisher information of the elements' logarithms, both delays [µs], and the sizes of changes.
 
-    `band` is the highest frequency, relative to the sample rate.
+    `band` is the highest frequency, relative to the sample rate. With `one_pulse`, the amplitude of
+    the second pulse and its delay [µs] come before the changes.
     """
     scene = rung("dry", snr_db=snr_db)
     wave = scene.waveform()
@@ -88,15 +92,20 @@ def information(
     loads = load(f), np.full(f.size, complex(REFERENCE))
     gains = loading(loads[0], z_th), loading(loads[1], z_th)
     changed = [change(Records(f, loads[0], z_th, gains)) for change in changes]
-    # Rows: V_out with the skin and the resistor, then both V_th. Columns of b: both X, and Z_th.
-    a = np.zeros((f.size, 4, 5 + len(changes)), complex)
-    b = np.zeros((f.size, 4, 3), complex)
+    # Rows: V_out with the skin and the resistor, then both V_th. Columns of b: Z_th, and each X.
+    known = 7 if one_pulse else 5
+    a = np.zeros((f.size, 4, known + len(changes)), complex)
+    b = np.zeros((f.size, 4, 2 if one_pulse else 3), complex)
+    late = -2e-6j * np.pi * f
     for i in range(2):
-        b[:, i, i], b[:, 2 + i, i] = gains[i], 1
-        b[:, i, 2] = -gains[i] * x / (loads[i] + z_th)
-        a[:, i, 3 + i] = -2e-6j * np.pi * f * gains[i] * x
+        each = 1 if one_pulse else 1 + i
+        b[:, i, each], b[:, 2 + i, each] = gains[i], 1
+        b[:, i, 0] = -gains[i] * x / (loads[i] + z_th)
+        a[:, i, 3 + i] = late * gains[i] * x
         for column, pair in enumerate(changed):
-            a[:, i, 5 + column] = pair[i] * x
+            a[:, i, known + column] = pair[i] * x
+    for row, gain_of in ((1, gains[1]), (3, np.ones(f.size))) if one_pulse else ():
+        a[:, row, 5], a[:, row, 6] = gain_of * x, late * gain_of * x
     a[:, 0, :3] = (x * z_th / (loads[0] + z_th) ** 2)[:, None] * slope
     q, _ = np.linalg.qr(b)
     rest = (a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)).reshape(-1, a.shape[-1])
@@ -105,5 +114,6 @@ def information(
 
 def missed(load: SkinLoad, snr_db: float, change: Change) -> float:
     """Probability that the best test misses a change behind a skin."""
-    at = 1 / np.sqrt(np.linalg.inv(information(load, snr_db, BAND, change))[-1, -1])
+    of = information(load, snr_db, BAND, change, one_pulse=True)
+    at = 1 / np.sqrt(np.linalg.inv(of)[-1, -1])
     return float(scipy.stats.norm.cdf(LIMIT - at) - scipy.stats.norm.cdf(-LIMIT - at))

@@ -113,6 +113,22 @@ def test_the_states_of_a_load_have_its_impedance(circuit, samples, digits):
     np.testing.assert_allclose(np.array(z) + np.asarray(system.D)[0], expected, rtol=digits)
 
 
+@pytest.mark.parametrize(
+    ("cause", "effect", "element", "error"),
+    [("v_out", "current", 1, -0.012), ("current", "v_out", 0, 0.06)],
+)
+def test_crosstalk_between_the_channels_passes_with_the_error_of_the_guide(
+    skin, cause, effect, element, error
+):
+    """One per cent of the peak: a resistor in parallel, or in series with the load."""
+    peak = {name: np.abs(getattr(skin, name)).max() for name in ("v_out", "current")}
+    other = 0.01 * peak[effect] / peak[cause] * getattr(skin, cause)
+    fit = etid.identify_skin(skin.replace(**{effect: getattr(skin, effect) + other}))
+    assert fit.verdict == "successful"
+    values = np.asarray(fit.circuit.values()) / np.asarray(SKIN.values())
+    np.testing.assert_allclose(values[element] - 1, error, rtol=0.1)  # two digits are printed
+
+
 def test_a_prediction_from_the_current_misses_by_the_noise(skin):
     rest = etid.predict(skin, circuit=etid.identify_skin(skin).circuit) - skin.v_out
     # The noise of both channels is 1e-3 of each; that of the current passes the skin.

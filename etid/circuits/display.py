@@ -3,6 +3,8 @@
 Inside etid all numbers are in SI units. Only text, tables and figures use the units of this module.
 """
 
+import math
+
 import numpy as np
 
 # Unit for the display of a parameter, by its SI unit: size in the SI unit, and symbol.
@@ -85,6 +87,11 @@ def between(low: float, high: float, unit: str) -> str:
         return f"{low / scale:.4g} … {high / scale:.4g} {symbol}".rstrip()
     digits = int(np.clip(1 - np.floor(np.log10(quarter)), 0, 9))
     return f"{low / scale:.{digits}f} … {high / scale:.{digits}f} {symbol}".rstrip()
+
+
+def unexplained(rrse: float) -> str:
+    """A root relative squared error; an estimate that diverges predicts nothing."""
+    return f"RRSE {100 * rrse:.3g} %" if math.isfinite(rrse) else "no finite prediction"
 
 
 def several(count: int, noun: str) -> str:

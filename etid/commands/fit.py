@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from etid.circuits.display import DISPLAY, heading, several
+from etid.circuits.display import DISPLAY, heading, several, unexplained
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.commands.circuits import add_circuit
 from etid.estimators import registry
@@ -241,7 +241,7 @@ def _summary(outcome: StudyFits) -> str:
     for paths, driver in outcome.drivers.items():
         text = (
             f"order {driver.order}, {driver.verdict}, "
-            f"RRSE {100 * float(driver.rrse):.3g} %, chi2 {float(driver.chi2):.3g}"
+            f"{unexplained(float(driver.rrse))}, chi2 {float(driver.chi2):.3g}"
         )
         lines.append(f"driver {', '.join(paths)}: {text}. {message(driver.verdict)}".rstrip(". "))
     lines += [f"driver {', '.join(paths)}: {text}" for paths, text in outcome.failures.items()]

@@ -13,7 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.circuits.display import plus_minus, several
+from etid.circuits.display import plus_minus, several, unexplained
 from etid.circuits.overview import Overview
 from etid.numpy_tier.tiers import program
 from etid.recordings.recording import Recording
@@ -201,7 +201,7 @@ class Driver(AbstractFeed):
         notes = [*self._findings(), *([message(verdict)] if verdict != "successful" else [])]
         return Overview(
             f"Driver of order {self.order}: {verdict} in {several(int(self.steps), 'step')} "
-            f"({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}",
+            f"({self.method}), {unexplained(float(self.rrse))}, chi2 {float(self.chi2):.3g}",
             rows,
             notes=[*notes, *texts(int(self.remarks))],
         )

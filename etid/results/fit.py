@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import Circuit
-from etid.circuits.display import quantity, several
+from etid.circuits.display import quantity, several, unexplained
 from etid.circuits.overview import Overview, element_rows
 from etid.recordings.remarks import texts, words
 from etid.results.data import HasSource
@@ -387,7 +387,7 @@ class Fit(Judged, HasSource[Circuit]):
             return Overview(batch, rows)
         method, told = without_known(self.method, self.circuit.units())
         title = f"{kind}: {verdict} in {several(int(self.steps), 'step')} ({method})"
-        title += f", RRSE {100 * float(self.rrse):.3g} %"
+        title += f", {unexplained(float(self.rrse))}"
         if self.measured is None or self.measured.stderr is not None:
             title += f", chi2 {float(self.chi2):.3g}"  # without standard errors there is none
         outside = "" if verdict == "out_of_bounds" else self.outside
