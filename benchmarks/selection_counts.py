@@ -1,8 +1,9 @@
 """From choices to rates: right and spurious circuits by three criteria, and coverage.
 
 A circuit is *decisively* supported at an SNR if 2 log evidence of the true circuit exceeds that of
-every simpler candidate by `DECISIVE` in the mean over the drivers. Richer candidates cannot enter
-this: they contain the truth, and lose ln n, about 7, for each spurious element whatever the SNR.
+every candidate that is not richer by `DECISIVE` in the mean over the drivers. Richer candidates
+cannot enter this: they contain the truth, and lose ln n, about 7, for each spurious element
+whatever the SNR.
 
 The criteria are compared on the same fits, all candidates being fitted, with the rest of the rule
 unchanged (`etid.selection.evidence`). AICc is −2 log L + 2 p + 2 p (p + 1) / (n − p − 1). The
@@ -84,12 +85,12 @@ CRITERIA: Mapping[str, Criterion] = {
 
 
 def gained(drawn: Drawn) -> float:
-    """2 log evidence of the true circuit minus the largest one of a simpler circuit."""
+    """2 log evidence of the true circuit minus the largest one of a circuit that is not richer."""
     truth, evidence = TRUTHS[drawn.truth], bic(drawn.fits)
     size = {number: len(kind.names()) for number, kind in enumerate(USUAL)}
     true = USUAL.index(type(truth))
-    simpler = [evidence[number] for number in size if size[number] < size[true]]
-    return min(simpler, default=math.inf) - evidence[true]
+    others = [evidence[of] for of in size if size[of] <= size[true] and of != true]
+    return min(others, default=math.inf) - evidence[true]
 
 
 def cell(drawn: Sequence[Drawn]) -> dict[str, Any]:

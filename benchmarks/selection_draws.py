@@ -43,9 +43,11 @@ def _truths() -> dict[str, AbstractCircuit]:
         for alpha in (0.96, 0.9, 0.8):
             tau = skin.r_p * skin.c_p
             found[f"Cole {alpha}, {name}"] = SkinCole(skin.r_s, skin.r_p, tau, alpha)
-        for share, slower in ((0.5, 4.5), (0.3, 10.0)):
+        found[f"Warburg, {name}"] = etid.SkinWarburg(skin.r_s, skin.r_p, 3 * skin.r_p * skin.c_p)
+        for share, slower in ((0.5, 2.0), (0.5, 4.5), (0.3, 10.0)):
             found[f"layers {share}, {slower:g}, {name}"] = _layers(skin, share, slower)
-    order = [one.__name__ for one in (Resistor, ParallelRC, SkinRC, SkinCole, etid.SkinLayers)]
+    simplest_first = Resistor, ParallelRC, SkinRC, SkinCole, etid.SkinWarburg, etid.SkinLayers
+    order = [one.__name__ for one in simplest_first]
     return dict(sorted(found.items(), key=lambda item: order.index(type(item[1]).__name__)))
 
 
@@ -79,10 +81,13 @@ class Drawn:
         return len(self.chosen.names()) > len(TRUTHS[self.truth].names())
 
 
-def scene(snr_db: float, driver: int) -> Scene:
+def scene(snr_db: float, driver: int, names: Sequence[str] = tuple(TRUTHS)) -> Scene:
     """A calibration and one recording of each truth behind a driver of its own."""
-    behind = drawn_driver(driver, PARTS, TransformerDriver())
-    return recorded(TRUTHS, {"calibration": REFERENCE}, driver=behind, snr_db=snr_db)
+    behind, loads = (
+        drawn_driver(driver, PARTS, TransformerDriver()),
+        {of: TRUTHS[of] for of in names},
+    )
+    return recorded(loads, {"calibration": REFERENCE}, driver=behind, snr_db=snr_db)
 
 
 def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Selection]:
@@ -97,13 +102,13 @@ def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Sele
     return found
 
 
-def draws(snr_db: float, number: int) -> list[Drawn]:
+def draws(snr_db: float, number: int, names: Sequence[str] = tuple(TRUTHS)) -> list[Drawn]:
     """One recording of each truth behind a driver [dB]; none if the driver is not identified."""
-    study = scene(snr_db, number).simulate(number)
+    study = scene(snr_db, number, names).simulate(number)
     driver = etid.identify_driver(study["calibration"], throw=False)
     if driver.verdict != "successful":
         return []
-    records = [study[name] for name in TRUTHS]
+    records = [study[name] for name in names]
     chosen = choices(records, driver)
     fits = [dict(one.fits) for one in chosen]
     for candidate, circuit in enumerate(usual_circuits()):
@@ -112,7 +117,7 @@ def draws(snr_db: float, number: int) -> list[Drawn]:
             more = etid.identify_skins([records[row] for row in rows], driver, circuit=circuit)
             for place, row in enumerate(rows):
                 fits[row][candidate] = more[place]
-    of_all = zip(TRUTHS, chosen, fits, strict=True)
+    of_all = zip(names, chosen, fits, strict=True)
     return [Drawn(name, snr_db, number, one, of) for name, one, of in of_all]
 
 

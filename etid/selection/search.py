@@ -3,8 +3,10 @@
 The first candidate is fitted to all recordings. If the score tests of the fit, which cost no
 further fit, show a change that its circuit cannot make, all candidates with as many or more
 elements are fitted: the weight of a circuit means nothing while a likelier one may be missing. The
-simpler ones are fitted if an element is hardly determined. An ordinary recording thus needs one
-fit. Records of millions of samples end the search after `PATIENCE`, with what was found so far.
+simpler ones are fitted if an element is hardly determined. Those with as many elements are fitted
+where noise could hide them from the tests: behind damp skin at 40 dB, a layer through which charge
+diffuses looks like R_s + R_p ‖ C_p with half more R_s. A recording at 60 dB thus needs one fit.
+Records of millions of samples end the search after `PATIENCE`, with what was found so far.
 """
 
 import time
@@ -40,6 +42,9 @@ ASKS = 2.8
 # Relative standard error of an element that asks for a simpler circuit: an element of seven
 # standard errors has the evidence 49, more than its penalty by far.
 DOUBTFUL = 1 / 7
+# Relative standard error of an element that another circuit with as many elements may hide in. The
+# evidence against a diffusive layer in place of damp skin is at least 5e-4 over its square for R_s.
+ROUGH = 4e-3
 PATIENCE = 60.0  # [s] for each recording, after which no further candidate is fitted
 FitRows = Callable[[int, Sequence[int]], Sequence[Fit]]
 
@@ -83,7 +88,9 @@ def asked(fits: Mapping[int, Fit], candidates: Sequence[AbstractCircuit]) -> lis
     more = []
     if accepted == 2 or _lacks(fit) > ASKS:
         more += [number for number in left if size[number] >= own]
-    if accepted == 1 or _is_doubtful(fit):
+    elif not _is_known(fit, ROUGH):
+        more += [number for number in left if size[number] == own]
+    if accepted == 1 or not _is_known(fit, DOUBTFUL):
         more += [number for number in left if size[number] < own]
     return more
 
@@ -98,8 +105,8 @@ def _lacks(fit: Fit) -> float:
     return float(np.nanmax(np.abs(z), initial=0.0))
 
 
-def _is_doubtful(fit: Fit) -> bool:
-    """Whether an element may be superfluous."""
+def _is_known(fit: Fit, part: float) -> bool:
+    """Whether the standard error of each element is less than this part of it."""
     errors = np.sqrt(np.diagonal(np.asarray(fit.cov)))
     # An error of 0 belongs to an element without any effect.
-    return not bool(((errors > 0) & (errors < DOUBTFUL * values_of(fit))).all())
+    return bool(((errors > 0) & (errors < part * values_of(fit))).all())
