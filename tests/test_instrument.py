@@ -1,5 +1,6 @@
 """Tolerances of the instrument: in the standard errors, in a budget, and in files."""
 
+import datetime
 import functools
 from typing import Any
 
@@ -31,6 +32,7 @@ GAIN = etid.Instrument(gain=1e-3)
 ALL = etid.Instrument(gain=2e-3, r_load=2e-3, crosstalk=2e-3, capacitance=2e-12)
 DRAWS = 40
 STUDIES = 16  # of ten fits each
+SINCE = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 CHARGE = 1e-7  # [C] of the size of a phase
 NORMAL_95 = scipy.stats.norm.ppf(0.975)
 
@@ -185,8 +187,36 @@ def test_an_instrument_is_a_field_of_the_calibrations(tmp_path):
     other = records(seed=1)[0].replace(path="again", instrument="gain=2e-3")
     with pytest.raises(etid.RecordingError, match="same tolerances"):
         etid.identify_driver([told, other])
+    with pytest.raises(etid.RecordingError, match="only a calibration"):
+        skin.replace(instrument="gain=1e-3")
     with pytest.raises(ValueError, match="no drift between them"):
         etid.identify_jointly(etid.Study.from_recordings([told, skin]))
+    # Steiglitz-McBride has no standard errors that a file's statement could enter.
+    baseline = etid.identify_driver(told, method="steiglitz_mcbride", throw=False)
+    assert baseline.method == "steiglitz_mcbride"
+    # A driver keeps in its file what was passed, in other words too.
+    passed = etid.identify_driver(told, instrument=etid.Instrument(gain=0.001))
+    passed.write(tmp_path / "driver.h5")
+    again = etid.read_driver(tmp_path / "driver.h5")
+    assert isinstance(again, ContinuousDriver)
+    assert again.instrument is not None
+    assert again.instrument.stored() == {"gain": 1e-3}
+
+
+def test_a_file_with_an_instrument_is_checked_exported_and_fitted_otherwise(tmp_path, capsys):
+    calibration, skin = exact()
+    file = tmp_path / "study.h5"
+    etid.Study.from_recordings([calibration.replace(instrument="delay=5ns"), skin]).write(file)
+    assert cli.main(["check", str(file)]) == 1
+    assert "'delay=5ns' is no number" in capsys.readouterr().out
+    told = calibration.replace(instrument="gain=1e-3 drift=0.01")
+    etid.Study.from_recordings([told, skin]).write(file)
+    assert cli.main(["check", str(file)]) == 0
+    with etid.read(file) as study:
+        fits = etid.identify_jointly(study, instrument=GAIN)  # what is passed counts
+        assert fits.fits.verdicts == ["successful"]
+        etid.export_study(file, tmp_path / "study.nwb", session_start=SINCE)
+    assert (tmp_path / "study.nwb").exists()
 
 
 def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax():
@@ -314,6 +344,20 @@ def test_a_tracker_has_the_errors_of_the_instrument(kind):
             added, moved = added[:-1], moved[:-1]
         # What a tolerance adds is what an error of its size does, as in the budget of a fit.
         np.testing.assert_allclose(added, moved, rtol=0.1, atol=0.05 * moved.max(), err_msg=source)
+
+
+def test_a_stated_delay_is_no_help_to_a_tracker_whose_windows_begin_between_two_samples():
+    calibration, skin = exact()
+    found = []
+    for instrument in (None, etid.Instrument(delay=5e-9)):
+        driver = etid.identify_driver(calibration, instrument=instrument)
+        tracker = etid.Tracker.of(driver, calibration, electrodes=10)
+        state = tracker.start()
+        for v_out in tracker.pulses(np.tile(skin.v_out, (10, 1))):
+            state = tracker.update(state, v_out)
+            assert set(tracker.read(state).verdicts) == {"successful"}
+        found.append(np.asarray(tracker.read(state)[0].circuit.values()))
+    assert np.abs(np.log(found[1] / found[0])).max() < 0.01  # the driver's delay is another
 
 
 def drawn(number) -> dict[str, Any]:

@@ -143,8 +143,9 @@ etid.identify_study(of.study, plausible=(-1.0, 3e2)) -> plausible: is \(\-1\.0, 
 etid.identify_jointly(of.study, plausible=(1.0, np.nan)) -> plausible: is \(1\.0, nan\), must be
 etid.fit_file('absent.h5', 'fits.h5', plausible=(1.0, 1.0)) -> plausible: is \(1\.0, 1\.0\), must
 etid.Instrument(drift=1.0) -> drift .* is 1\.0; it is a standard deviation \[relative\], at least
-etid.Instrument(delay=1.0) -> delay .* is 1\.0; it is a standard deviation \[s\], at least
-etid.identify_study(of.study, method='equation_error', instrument=etid.Instrument()) -> gives none
+etid.Instrument(delay=1.0) -> delay .* is 1\.0; it is a standard deviation \[s\], above 0
+etid.Instrument(delay=0.0) -> delay .* is 0\.0; it is a standard deviation \[s\], above 0
+etid.identify_study(of.study, method='equation_error', instrument=GAIN) -> gives none
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=-0.1)) -> r_load .* is \-0\.1; it
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=np.nan)) -> r_load .* is nan; it
 etid.identify_study(of.study, method='equation_error', fixed={'r_s': 1.0}) -> no known elements

@@ -7,8 +7,10 @@ import numpy as np
 
 from etid.circuits.display import several
 from etid.commands import DONE, WRONG_DATA, Outcome
+from etid.identify.options import instrument_of
 from etid.recordings import hdf5
 from etid.recordings.causes import how_shifted, sizes
+from etid.recordings.errors import RecordingError
 from etid.recordings.preflight import Inspected, is_plausible
 from etid.recordings.study import Study
 from etid.results.verdicts import message
@@ -21,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Return all faults of the file, or remarks on recordings without a fault."""
-    problems = hdf5.check(arguments.file)
+    problems = hdf5.check(arguments.file) or _unreadable(arguments.file)
     places = [
         {"path": each.path, "field": each.field, "message": each.message, "remedy": each.remedy}
         for each in problems
@@ -35,6 +37,18 @@ def run(arguments: argparse.Namespace) -> Outcome:
     lines = [f"{arguments.file}: {several(data['recordings'], 'recording')}, no faults"]
     lines += [f"{one['path']}: {one['message']}" for one in found]
     return Outcome("\n".join(lines), data, DONE)
+
+
+def _unreadable(file: pathlib.Path) -> list[RecordingError]:
+    """A fault for each calibration whose instrument cannot be read."""
+    found = []
+    with hdf5.read(file) as study:
+        for path in study.calibrations:
+            try:
+                instrument_of([study.metadata(path)])
+            except RecordingError as error:
+                found.append(error)
+    return found
 
 
 def _remarks(study: Study) -> list[dict[str, str]]:

@@ -117,7 +117,7 @@ def _columns() -> dict[str, str]:
 
 
 def _row(source: AbstractSource, series: Mapping[str, str]) -> dict[str, Any]:
-    """Line of the table for a recording; paths are text, and an unknown number is NaN."""
+    """Line of the table for a recording; paths are text, an unknown number is NaN, a text empty."""
     metadata = source.metadata
     row: dict[str, Any] = {"path": metadata.path, "kind": metadata.kind}
     for name, field in DECLARED.items():
@@ -125,6 +125,6 @@ def _row(source: AbstractSource, series: Mapping[str, str]) -> dict[str, Any]:
         if field.type == "paths":
             value = "\n".join(value)
         elif value is None:
-            value = (np.nan, np.nan) if field.type == "range" else np.nan
+            value = {"range": (np.nan, np.nan), "text": ""}.get(field.type, np.nan)
         row[name] = value
     return row | {name: series.get(name, "") for name in SIGNALS}

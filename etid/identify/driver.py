@@ -31,6 +31,7 @@ from etid.precision import in_float64
 from etid.recordings.causes import LOG, log_changes
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
+from etid.recordings.remarks import Remark
 from etid.recordings.repeats import repeats
 from etid.results.driver import AUTO, ContinuousDriver, Driver, HarmonicDriver, Order
 from etid.results.fit import IdentificationError
@@ -91,6 +92,8 @@ def identify_driver(
     single = isinstance(calibrations, Recording)
     records = recordings("calibrations", [calibrations] if single else calibrations)
     driver = calibrated(records, options, throw)
+    if instrument is not None:  # a file of this driver states it
+        records = [one.replace(instrument=instrument.text() or None) for one in records]
     object.__setattr__(driver, "recordings", tuple(records))  # the module is frozen
     return driver
 
@@ -126,7 +129,10 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     for one in seen:
         _refused(one, "biased" if estimator.lane.periodic and one.is_aliased else None)
     check_order(options.order, estimator)
-    instrument = options.instrument or instrument_of(records)
+    instrument = options.instrument
+    # What a file states enters no standard errors where there are none.
+    if instrument is None and issubclass(estimator.driver, ContinuousDriver):
+        instrument = instrument_of(records)
     check_instrument(instrument, estimator)
     arrays = None if instrument is None else instrument.as_arrays()
     if options.order == AUTO:
@@ -245,7 +251,11 @@ def with_harmonics(driver: ContinuousDriver, calibrations: Sequence[Recording]) 
     for one in seen:
         _refused(one, preflight(one, periodic=True))
     own = {of.name: getattr(driver, of.name) for of in dataclasses.fields(ContinuousDriver)}
-    spectra = _clear(_lanes(seen, Harmonics))
+    records = _lanes(seen, Harmonics)
+    if int(driver.remarks) & Remark.mains_hum:
+        few = records.selected & ~mains.lines(records.frequency)
+        records = dataclasses.replace(records, selected=few)
+    spectra = _clear(records)
     return HarmonicDriver(**own, spectra=spectra, missing_pole=jax.device_put(np.nan))
 
 

@@ -5,6 +5,7 @@ not show this error. A joint fit determines the driver better than its calibrati
 standard errors separate the own error of a trial from the error that all trials share.
 """
 
+import contextlib
 import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -50,11 +51,12 @@ from etid.identify.fitting import (
     refitted,
     remarks_on,
 )
-from etid.identify.options import Circuit, Interval, Options, candidates_of
+from etid.identify.options import Circuit, Interval, Options, candidates_of, instrument_of
 from etid.identify.planning import Refusal, batches, failed_fit
 from etid.identify.study import Drivers, common_first, fields_of, table
 from etid.numpy_tier.tiers import program, worth_compiling
 from etid.precision import in_float64
+from etid.recordings.errors import RecordingError
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.recordings.study import Study
@@ -397,13 +399,14 @@ def identify_jointly(
 
 def _check_steady(study: Study, instrument: Instrument | None) -> None:
     """Raise ValueError if an instrument says that a driver drifts."""
-    stated = [] if instrument is None else [*instrument.stored()]
-    for path in study.calibrations:
-        stated += (study.metadata(path).instrument or "").replace("=", " ").split()
-    if "drift" in stated:
+    told = [instrument]
+    for path in study.calibrations if instrument is None else ():
+        with contextlib.suppress(RecordingError):  # costs the recordings of that driver alone
+            told.append(instrument_of([study.metadata(path)]))
+    if any("drift" in one.stored() for one in told if one is not None):
         raise ValueError(
             "a joint fit identifies each driver together with all its recordings, so that it has "
-            "no drift between them; remove drift from the instrument, or use identify_study"
+            "no drift between them; use identify_study, or pass an instrument without drift"
         )
 
 

@@ -33,6 +33,7 @@ from etid.identify.arguments import (
     range_of,
     require,
 )
+from etid.recordings.fields import Metadata
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
@@ -243,45 +244,50 @@ def check_circuits(estimator: AbstractEstimator, circuits: Sequence[AbstractCirc
 
 def check_instrument(instrument: Instrument | None, estimator: AbstractEstimator) -> None:
     """Raise ValueError if an estimator has no parameters for the tolerances of an instrument."""
-    if instrument is None or isinstance(estimator, MaximumLikelihood):
+    if instrument is None or isinstance(estimator, MaximumLikelihood) or not instrument.stored():
         return
     if not issubclass(estimator.driver, ContinuousDriver):
         raise ValueError(
             "the tolerances of an instrument enter standard errors, and method "
-            f"{str(estimator)!r} gives none; identify the driver without instrument=, or use "
-            "method='maximum_likelihood'"
+            f"{str(estimator)!r} gives none; use method='maximum_likelihood', or state nothing, as "
+            "in instrument=etid.Instrument() or --tolerance drift=0"
         )
     if instrument.states_errors:
         raise ValueError(
             "the tolerances of an instrument are parameters of maximum likelihood, and the method "
             f"is {str(estimator)!r}, which has the drift of a driver only; record three pulse "
-            "periods or more, or identify the driver without instrument="
+            "periods or more, or state nothing else, as in instrument=etid.Instrument() or "
+            "--tolerance drift=0"
         )
 
 
-def instrument_of(calibrations: Sequence[Recording]) -> Instrument | None:
+def instrument_of(calibrations: Sequence[Recording | Metadata]) -> Instrument | None:
     """The instrument that the calibrations of a driver state; None if they state none.
 
     Raises:
         RecordingError: A statement cannot be read, or two of them differ.
     """
-    first = calibrations[0]
-    for other in calibrations:
-        if other.instrument != first.instrument:
+    first, told = calibrations[0], [_stated(one) for one in calibrations]
+    for other, one in zip(calibrations, told, strict=True):
+        if (one and one.stored()) != (told[0] and told[0].stored()):
             raise RecordingError(
                 f"is {other.instrument!r}; that of {first.path!r} is {first.instrument!r}",
                 path=other.path,
                 field="instrument",
                 remedy="State the same tolerances in all calibrations of a driver",
             )
-    if first.instrument is None:
+    return told[0]
+
+
+def _stated(calibration: Recording | Metadata) -> Instrument | None:
+    if calibration.instrument is None:
         return None
     try:
-        return Instrument.read(first.instrument)
+        return Instrument.read(calibration.instrument)
     except ValueError as error:
         raise RecordingError(
-            f"is {first.instrument!r}: {error}",
-            path=first.path,
+            f"is {calibration.instrument!r}: {error}",
+            path=calibration.path,
             field="instrument",
             remedy="Write standard deviations by name, such as 'gain=1e-3 r_load=1e-3'",
         ) from error
@@ -351,6 +357,6 @@ def plan(
     if name is None and estimator.lane.periodic and seen.is_aliased:
         name = "biased"
     estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
-    if isinstance(driver, ContinuousDriver):
+    if isinstance(driver, ContinuousDriver) and issubclass(estimator.driver, ContinuousDriver):
         check_instrument(driver.instrument, estimator)
     return options.given_to(estimator), name

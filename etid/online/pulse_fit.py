@@ -67,7 +67,6 @@ class GainModel(eqx.Module):
             deviation of 1.
         faults: Gain, crosstalk and capacitance of the instrument by the same errors; None if it has
             no tolerances.
-        delay_width: Prior standard deviation of the delay of a pulse [samples].
     """
 
     circuit: AbstractCircuit
@@ -79,7 +78,6 @@ class GainModel(eqx.Module):
     noise_freedom: Float[Array, ""]
     source_error: Complex[Array, "z band"]
     faults: Float[Array, "z 3"] | None = None
-    delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
 
     @classmethod
     def of(
@@ -100,8 +98,7 @@ class GainModel(eqx.Module):
         independent = root(known.cov).T
         error = combined(independent, by_source)
         faults = None if known.faults is None else independent @ known.faults[1]
-        of = circuit, bands, source, source_alias, turn, turns, freedom, error, faults
-        return cls(*of, known.delay_width)
+        return cls(circuit, bands, source, source_alias, turn, turns, freedom, error, faults)
 
     def by_fault(self, gain: Complex[Array, " band"]) -> Complex[Array, "3 band"]:
         """Changes of a gain by gain, crosstalk and capacitance of the instrument."""
@@ -327,7 +324,7 @@ class Pulse(eqx.Module):
     def pull(self, own: LoadUnknowns) -> Float[Array, " own"]:
         """Half the gradient of what is known before the pulse."""
         at = self.information @ (own.log_elements - self.centre)
-        return LoadUnknowns(at, own.delay_samples / self.model.delay_width**2).vector()
+        return LoadUnknowns(at, own.delay_samples / DELAY_WIDTH**2).vector()
 
     def equations(
         self,
@@ -345,8 +342,8 @@ class Pulse(eqx.Module):
         residual = self.residual(expected, own.delay_samples)
         pull, squares = self.pull(own), jnp.dot(residual, residual)
         curvature = jacobian @ jacobian.T
-        width = self.model.delay_width
-        prior = jnp.pad(self.information, (0, 1)).at[-1, -1].set(1 / width**2)
+        # A stated delay is no help: a window begins up to half a sample beside its pulse.
+        prior = jnp.pad(self.information, (0, 1)).at[-1, -1].set(1 / DELAY_WIDTH**2)
         return Equations(
             squares + jnp.dot(pull, self.off(own)),
             squares,

@@ -346,6 +346,12 @@ class Metadata(AbstractFields):
                 "a recording with a known resistor (r_load) is a calibration; it has none itself",
                 field="calibration",
             )
+        if self.r_load is None and self.instrument is not None:
+            raise RecordingError(
+                "only a calibration, which has a known resistor (r_load), states the instrument",
+                field="instrument",
+                remedy="State it in the calibrations of this recording",
+            )
 
     def of_trial(self, path: str, trial: str) -> "Metadata":
         """The same with the path and the label of a trial, which no check concerns."""

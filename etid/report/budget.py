@@ -1,9 +1,11 @@
 """The uncertainty budget of a typical recording: what to buy or to record next."""
 
+import contextlib
+
 import numpy as np
 
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.driver import with_harmonics
+from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.study import Study
 from etid.report.html import Section, Table
@@ -17,12 +19,12 @@ from etid.results.study_fits import StudyFits
 def budgets(found: StudyFits, study: Study | None) -> list[Section]:
     """The budget of the fit whose standard errors are the median; none without its recording.
 
-    Fits by other methods than maximum likelihood, and joint fits in a file, have none.
+    Fits by another method than maximum likelihood or by several have none, nor joint fits in files.
     """
     errors = relative_stderr(found.fits)
     errors[np.asarray(found.fits.verdicts) != "successful"] = np.nan
     rows = np.argsort(errors)[: np.sum(np.isfinite(errors))]
-    if study is None or not rows.size or found.fits.fit.method != str(MAXIMUM_LIKELIHOOD):
+    if study is None or not rows.size:
         return []
     row = int(rows[(rows.size - 1) // 2])
     path = str(found.fits.labels["path"][row])
@@ -45,11 +47,14 @@ def budgets(found: StudyFits, study: Study | None) -> list[Section]:
 
 def _of(found: StudyFits, study: Study, row: int, path: str) -> Budget | None:
     """The budget of a fit; None if its driver is no longer known."""
-    recording = study[path]
+    recording, other = study[path], found.settings.driver if found.settings else ""
     names = recording.calibration or tuple(study.calibrations)
+    if other:  # the only driver, of another file
+        names = next(iter(found.drivers), ())
     driver = found.drivers.get(names)
+    if isinstance(driver, ContinuousDriver) and not isinstance(driver, HarmonicDriver):
+        with read(other) if other else contextlib.nullcontext(study) as known:
+            driver = with_harmonics(driver, [known[name] for name in names])
     if not isinstance(driver, HarmonicDriver):
-        if not isinstance(driver, ContinuousDriver):
-            return None
-        driver = with_harmonics(driver, [study[name] for name in names])
+        return None
     return found.fits[row].budget(recording, driver)

@@ -111,11 +111,12 @@ def _facts(
 
 
 def _instrument(found: StudyFits) -> str:
-    """What the drivers state of the instrument."""
+    """What is stated of the instrument: in the settings, as in former files, and by the drivers."""
     drivers = [one for one in found.drivers.values() if isinstance(one, ContinuousDriver)]
     told = [one.instrument.stored() for one in drivers if one.instrument is not None]
-    stated = (f"{name} {value:g}" for of in told for name, value in of.items())
-    return ", ".join(dict.fromkeys(stated))
+    stated = [f"{name} {value!r}" for of in told for name, value in of.items()]
+    asked = [] if found.settings is None else [*found.settings.instrument]
+    return ", ".join(dict.fromkeys([*asked, *stated]))
 
 
 def words(method: str) -> str:

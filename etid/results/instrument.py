@@ -56,11 +56,14 @@ class Instrument(eqx.Module):
 
     def __check_init__(self) -> None:
         for name, (largest, unit) in TOLERANCES.items():
-            value = getattr(self, name)
-            if isinstance(value, int | float) and not 0 <= value < largest:
+            value, least = getattr(self, name), "above 0" if name == "delay" else "at least 0"
+            if value is None or hasattr(value, "shape"):  # arrays, which may be traced
+                continue
+            number = isinstance(value, int | float) and 0 <= value < largest
+            if not number or (name == "delay" and value == 0):
                 raise ValueError(
                     f"{name} of an instrument is {value!r}; it is a standard deviation [{unit}], "
-                    f"at least 0 and below {largest:g}"
+                    f"{least} and below {largest:g}"
                 )
 
     @classmethod
@@ -99,7 +102,12 @@ class Instrument(eqx.Module):
     def stored(self) -> dict[str, float]:
         """The tolerances that are stated, by name."""
         told = {name: getattr(self, name) for name in TOLERANCES}
-        return {name: float(of) for name, of in told.items() if of is not None and of != 0}
+        numbers = {name: float(np.asarray(of)) for name, of in told.items() if of is not None}
+        return {name: of for name, of in numbers.items() if of}
+
+    def text(self) -> str:
+        """The text that `read` reads."""
+        return " ".join(f"{name}={value!r}" for name, value in self.stored().items())
 
     def as_arrays(self: _Kind) -> _Kind:
         """The same with arrays, which a traced program takes as operands; None without a drift."""

@@ -199,6 +199,7 @@ def imitated(recording: Recording, driver: Driver, load: SkinRC | Resistor, seed
         r_load=r_load,
         path=f"imitated/{seed}",
         adc_range=None,
+        instrument=None if r_load is None else recording.instrument,
     )
 
 

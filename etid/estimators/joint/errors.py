@@ -101,8 +101,8 @@ class Found(NamedTuple):
     Attributes:
         estimate: The estimate.
         other: Whether the data show another circuit or another gain of V_out.
-        scale: Whether they show another scale of the current, or all loads contradict the
-            tolerances of the instrument.
+        scale: Whether they show another scale of the current, or contradict the tolerances of the
+            instrument.
         delay: Its trigger delay.
         by_error: Changes of the logarithms of the elements with the prior mean of each error of the
             instrument.
@@ -180,8 +180,10 @@ def estimates(
             )
             delay = Delay(own.delay_samples, private[e, e], eliminated.slope[e])
             other, scale = _contradictions(at, load, own, eliminated, bread, total.score)
+            width = of.delay_width
+            late = load_fit.beyond(own.delay_samples / width, whole[e, e] / width**2)
             by_error = of.errors(eliminated.slope[:e] @ bread)
-            return Found(estimate, other, scale | beyond, delay, by_error)
+            return Found(estimate, other, scale | beyond | (late & load.used), delay, by_error)
 
         judged.append(in_turn(one, loads, own, *each, results))
     return cov, judged
