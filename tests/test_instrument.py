@@ -159,9 +159,9 @@ def test_a_stated_delay_narrows_the_errors_and_a_larger_one_contradicts_it():
     c_p = list(DRY.names()).index("c_p")
     # The bounds of `python -m benchmarks delays`: 0.36 and 0.14 %, for six periods less.
     assert relative(stated)[c_p] < 0.5 * relative(without)[c_p]
-    late = [*trials({"skin": DRY}, trigger_jitter_rms=100e-9, seed=2).recordings()]
-    assert fitted(*late).verdict == "successful"
-    assert fitted(*late, etid.Instrument(delay=1e-9)).verdict != "successful"
+    known, late = trials({"skin": DRY}, trigger_jitter_rms=100e-9, seed=2).recordings()
+    assert fitted(known, late).verdict == "successful"
+    assert fitted(known, late, etid.Instrument(delay=1e-9)).verdict != "successful"
 
 
 def test_an_instrument_is_a_field_of_the_calibrations(tmp_path):
@@ -178,9 +178,10 @@ def test_an_instrument_is_a_field_of_the_calibrations(tmp_path):
     stated = fitted(calibration, skin, etid.Instrument(gain=1e-3, drift=0.01, delay=2e-9))
     np.testing.assert_array_equal(np.asarray(fits.fits.cov[0]), np.asarray(stated.cov))
     # What is passed counts.
-    assert fitted(told, skin, GAIN).source_or_own(None, None)[1].instrument.stored() == {
-        "gain": 1e-3
-    }
+    other = etid.identify_driver(told, instrument=GAIN)
+    assert isinstance(other, ContinuousDriver)
+    assert other.instrument is not None
+    assert other.instrument.stored() == {"gain": 1e-3}
     for text, message in (("gain=x", "is no number"), ("gains=1", "is none of gain")):
         with pytest.raises(etid.RecordingError, match=message):
             etid.identify_driver(calibration.replace(instrument=text))

@@ -226,7 +226,7 @@ def _aligned(
 ) -> Driver:
     """The driver from calibrations that passed the pre-flight, aligned by their lags."""
     r_load = jax.device_put(np.asarray([one.recording.r_load for one in seen]))
-    records = _lanes(seen, Harmonics if estimator.lane.periodic else AlignedSamples)
+    records = _lanes(seen, Harmonics) if estimator.lane.periodic else _lanes(seen, AlignedSamples)
     driver = _identified(records, r_load, order, estimator, instrument)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
     # elsewhere.

@@ -41,8 +41,8 @@ def budgets(found: StudyFits, study: Study | None) -> list[Section]:
         "What stands behind “if” was not stated: such an error of the instrument would change the "
         "elements by this size, and is in no standard error."
     )
-    overview = budget._overview()
-    return [Section("Budget", text, (Table(("source", *budget.names), tuple(overview.rows)),))]
+    rows_shown = tuple(map(tuple, budget._overview().rows))
+    return [Section("Budget", text, (Table(("source", *budget.names), rows_shown),))]
 
 
 def _of(found: StudyFits, study: Study, row: int, path: str) -> Budget | None:

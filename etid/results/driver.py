@@ -255,7 +255,8 @@ class ContinuousDriver(Driver):
 
         None if there is no change. `cov` does not contain it.
         """
-        return None if self.instrument is None else self.instrument.drift
+        drift = None if self.instrument is None else self.instrument.drift
+        return np.asarray(drift) if isinstance(drift, int | float) else drift
 
     def drift_std(self) -> Float[Array, " parameter"]:
         """Standard deviations of the parameters of `source` that come from `drift` alone."""

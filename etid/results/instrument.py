@@ -111,11 +111,9 @@ class Instrument(eqx.Module):
 
     def as_arrays(self: _Kind) -> _Kind:
         """The same with arrays, which a traced program takes as operands; None without a drift."""
-        none = dict.fromkeys(ERRORS, 0.0) | {"drift": None}
-        told = none | self.stored()
-        return type(self)(
-            **{name: of if of is None else np.asarray(of) for name, of in told.items()}
-        )
+        told = {name: np.asarray(value) for name, value in self.stored().items()}
+        errors = {name: told.get(name, np.zeros(())) for name in ERRORS}
+        return type(self)(**errors, drift=told.get("drift"), delay=told.get("delay"))
 
 
 def by_tolerance(effects: Float[Array, "error element"]) -> Float[Array, "tolerance element"]:

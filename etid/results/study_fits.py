@@ -319,11 +319,12 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
     size = 1 + 4 * pairs + 2 * reals
     r_load = _numbers(stored, "r_load", None)
     delays = _numbers(stored, "delay_samples", r_load.size), _numbers(stored, "delay_std_samples")
-    told, instrument, tried = stored.get("instrument"), None, OrderEvidence.none()
-    numbers = {name: float(_numbers(told, name)) for name in TOLERANCES if name in (told or ())}
+    instrument, tried = None, OrderEvidence.none()
+    told: Mapping[str, Any] = stored.get("instrument") or {}
+    numbers = {name: float(_numbers(told, name)) for name in TOLERANCES if name in told}
     if stored.get("drift") is not None:
         numbers["drift"] = float(_numbers(stored, "drift"))
-    if told is not None or numbers:
+    if numbers or stored.get("instrument") is not None:
         instrument = Instrument(**numbers).as_arrays()
     if "tried" in stored:
         of, orders = stored["tried"], tried.bic.size
