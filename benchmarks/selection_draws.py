@@ -81,12 +81,10 @@ class Drawn:
         return len(self.chosen.names()) > len(TRUTHS[self.truth].names())
 
 
-def scene(snr_db: float, driver: int, names: Sequence[str] = tuple(TRUTHS)) -> Scene:
-    """A calibration and one recording of each truth behind a driver of its own."""
-    behind, loads = (
-        drawn_driver(driver, PARTS, TransformerDriver()),
-        {of: TRUTHS[of] for of in names},
-    )
+def scene(snr_db: float, driver: int, names: Sequence[str] | None = None) -> Scene:
+    """A calibration and one recording of each truth, or of these, behind a driver of its own."""
+    behind = drawn_driver(driver, PARTS, TransformerDriver())
+    loads = {name: TRUTHS[name] for name in names or TRUTHS}
     return recorded(loads, {"calibration": REFERENCE}, driver=behind, snr_db=snr_db)
 
 
@@ -102,8 +100,9 @@ def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Sele
     return found
 
 
-def draws(snr_db: float, number: int, names: Sequence[str] = tuple(TRUTHS)) -> list[Drawn]:
+def draws(snr_db: float, number: int, names: Sequence[str] | None = None) -> list[Drawn]:
     """One recording of each truth behind a driver [dB]; none if the driver is not identified."""
+    names = names or tuple(TRUTHS)
     study = scene(snr_db, number, names).simulate(number)
     driver = etid.identify_driver(study["calibration"], throw=False)
     if driver.verdict != "successful":

@@ -10,6 +10,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from etid.numpy_tier.tiers import program
 from etid.results.driver import SourceImpedance
 from etid.results.fit import Support
 from etid.results.instrument import Instrument
@@ -151,6 +152,7 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     return Prior(start, centre, width, frequency, 1e-3 * r_load)
 
 
+@program
 def delay_width(instrument: Instrument | None, sample_rate: Float[Array, ""]) -> Float[Array, ""]:
     """Standard deviation of the prior of a delay behind this instrument [samples]."""
     if instrument is None or instrument.delay is None:

@@ -109,9 +109,6 @@ def _source(
     return z_th(values), jax.jacfwd(z_th)(values).T
 
 
-_delay_width = program(delay_width)
-
-
 def _fitted(
     lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
 ) -> tuple[
@@ -132,7 +129,7 @@ def _fitted(
         size, vectors = np.linalg.eigh(np.asarray(feed.later_cov()))
         changes = (vectors * np.sqrt(np.maximum(size, 0.0))).T @ slopes
     instrument = None if isinstance(feed, MeasuredCurrent) else feed.instrument
-    width = np.asarray(_delay_width(instrument, jax.device_put(np.asarray(lane.sample_rate))))
+    width = np.asarray(delay_width(instrument, jax.device_put(np.asarray(lane.sample_rate))))
     deviations = np.append(width, np.ones(len(changes)))
 
     def at(p: Float[np.ndarray, " parameter"]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
