@@ -3,8 +3,7 @@
 Each study of `benchmarks.perturbed_study.undisturbed` gets errors that are drawn from the stated
 tolerances, one kind at a time or all of them, in its calibration and in dry and damp skin; a drift
 changes all parts of the driver, independently. Printed is the coverage (with the targets of
-`benchmarks.coverage`) of fits behind a driver and of joint
-fits.
+`benchmarks.coverage`) of fits behind a driver and of joint fits.
 """
 
 import argparse

@@ -175,11 +175,9 @@ def test_the_delay_of_the_calibration_is_known_as_well_as_its_standard_deviation
 
 def test_a_driver_that_drifts_is_one_that_is_known_less(fitted):
     driver, fit_of = fitted
-    drifting = dataclasses.replace(driver, instrument=etid.Instrument(drift=0.01).as_arrays())
-    drifts, less = (
-        fit_of(1.5, instrument=drifting.instrument),
-        fit_of(1.5, cov=drifting.later_cov()),
-    )
+    drift = etid.Instrument(drift=0.01).as_arrays()
+    later = dataclasses.replace(driver, instrument=drift).later_cov()
+    drifts, less = fit_of(1.5, instrument=drift), fit_of(1.5, cov=later)
     np.testing.assert_allclose(drifts.shared_cov, less.shared_cov, rtol=1e-6)
     assert (np.diagonal(drifts.shared_cov) > 2 * np.diagonal(fit_of(1.5).shared_cov)).any()
 

@@ -23,31 +23,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Return all faults of the file, or remarks on recordings without a fault."""
-    problems = hdf5.check(arguments.file) or _unreadable(arguments.file)
+    problems, count, found = hdf5.check(arguments.file), None, []
+    if not problems:
+        with hdf5.read(arguments.file) as study:
+            problems = _unreadable(study)
+            if not problems:
+                count, found = len(study), _remarks(study)
     places = [
         {"path": each.path, "field": each.field, "message": each.message, "remedy": each.remedy}
         for each in problems
     ]
-    data = {"file": arguments.file, "recordings": None, "problems": places, "remarks": []}
-    if problems:
+    data = {"file": arguments.file, "recordings": count, "problems": places, "remarks": found}
+    if count is None:
         return Outcome("\n".join(map(str, problems)), data, WRONG_DATA)
-    with hdf5.read(arguments.file) as study:
-        data["recordings"] = len(study)
-        found = data["remarks"] = _remarks(study)
-    lines = [f"{arguments.file}: {several(data['recordings'], 'recording')}, no faults"]
+    lines = [f"{arguments.file}: {several(count, 'recording')}, no faults"]
     lines += [f"{one['path']}: {one['message']}" for one in found]
     return Outcome("\n".join(lines), data, DONE)
 
 
-def _unreadable(file: pathlib.Path) -> list[RecordingError]:
+def _unreadable(study: Study) -> list[RecordingError]:
     """A fault for each calibration whose instrument cannot be read."""
     found = []
-    with hdf5.read(file) as study:
-        for path in study.calibrations:
-            try:
-                instrument_of([study.metadata(path)])
-            except RecordingError as error:
-                found.append(error)
+    for path in study.calibrations:
+        try:
+            instrument_of([study.metadata(path)])
+        except RecordingError as error:
+            found.append(error)
     return found
 
 

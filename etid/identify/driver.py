@@ -39,7 +39,6 @@ from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE
 from etid.results.verdicts import message, verdict
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
-from etid.signals import mains
 from etid.signals.harmonics import Spectrum
 from etid.signals.knots import above_noise, banded
 
@@ -231,9 +230,9 @@ def _aligned(
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
     # elsewhere.
     if isinstance(records, Harmonics) and (may_hum(driver) or driver.verdict != "successful"):
-        few = records.selected & ~mains.lines(records.frequency)
-        records = dataclasses.replace(records, selected=few)
-        driver = better_of(driver, _identified(records, r_load, order, estimator, instrument))
+        few = records.without_mains()
+        if few is not None:
+            driver = better_of(driver, _identified(few, r_load, order, estimator, instrument))
     return driver
 
 
@@ -253,8 +252,7 @@ def with_harmonics(driver: ContinuousDriver, calibrations: Sequence[Recording]) 
     own = {of.name: getattr(driver, of.name) for of in dataclasses.fields(ContinuousDriver)}
     records = _lanes(seen, Harmonics)
     if int(driver.remarks) & Remark.mains_hum:
-        few = records.selected & ~mains.lines(records.frequency)
-        records = dataclasses.replace(records, selected=few)
+        records = records.without_mains() or records
     spectra = _clear(records)
     return HarmonicDriver(**own, spectra=spectra, missing_pole=jax.device_put(np.nan))
 

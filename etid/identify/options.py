@@ -163,10 +163,7 @@ class Options:
             order=0 if self.order == AUTO else self.order,
             start=tuple(self.circuit.values().tolist()),
             candidates=tuple(type(one).__name__ for one in self.circuits if several),
-            instrument=tuple(
-                f"{name} {value!r}"
-                for name, value in (self.instrument.stored() if self.instrument else {}).items()
-            ),
+            instrument=() if self.instrument is None else self.instrument.listed(),
             plausible=self.plausible,
             fixed=tuple(f"{name} {value!r}" for name, value, error in self.known if not error),
             prior=tuple(

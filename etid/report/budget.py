@@ -9,7 +9,7 @@ from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.study import Study
 from etid.report.html import Section, Table
-from etid.report.waveforms import relative_stderr
+from etid.report.waveforms import calibrations_of, relative_stderr
 from etid.results.driver import ContinuousDriver, HarmonicDriver
 from etid.results.fit import IdentificationError
 from etid.results.instrument import Budget
@@ -48,9 +48,7 @@ def budgets(found: StudyFits, study: Study | None) -> list[Section]:
 def _of(found: StudyFits, study: Study, row: int, path: str) -> Budget | None:
     """The budget of a fit; None if its driver is no longer known."""
     recording, other = study[path], found.settings.driver if found.settings else ""
-    names = recording.calibration or tuple(study.calibrations)
-    if other:  # the only driver, of another file
-        names = next(iter(found.drivers), ())
+    names = calibrations_of(found, study, recording)
     driver = found.drivers.get(names)
     if isinstance(driver, ContinuousDriver) and not isinstance(driver, HarmonicDriver):
         with read(other) if other else contextlib.nullcontext(study) as known:

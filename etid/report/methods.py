@@ -7,6 +7,7 @@ uses; the sentences around them are in `templates/methods.txt`. The entries to c
 
 import importlib.metadata
 import importlib.resources
+import itertools
 import pathlib
 import re
 from collections.abc import Iterable, Sequence
@@ -69,7 +70,7 @@ def _facts(
     """What `templates/methods.txt` makes sentences of."""
     fits, settings, drivers = found.fits, found.settings, list(found.drivers.values())
     recordings = "recording" if len(fits) == 1 else f"{len(fits)} recordings"
-    candidates, typical = "", ""
+    candidates, typical, instrument = "", "", _instrument(found)
     if settings is not None:
         if settings.source:
             recordings += f" of {pathlib.Path(settings.source).name}"
@@ -103,8 +104,8 @@ def _facts(
         "orders": sorted({driver.order for driver in drivers}),
         "continuous": bool(continuous),
         "resistors": f"{resistors} kΩ" if resistors else "",
-        "instrument": _instrument(found),
-        "r_load_uncertain": "r_load" in _instrument(found),
+        "instrument": instrument,
+        "r_load_uncertain": "r_load" in instrument,
         "conditions": list(dict.fromkeys(c for one in used for c in one.conditions)),
         "of_driver": list(dict.fromkeys(c for one in of_drivers for c in one.of_driver)),
     }
@@ -113,10 +114,9 @@ def _facts(
 def _instrument(found: StudyFits) -> str:
     """What is stated of the instrument: in the settings, as in former files, and by the drivers."""
     drivers = [one for one in found.drivers.values() if isinstance(one, ContinuousDriver)]
-    told = [one.instrument.stored() for one in drivers if one.instrument is not None]
-    stated = [f"{name} {value!r}" for of in told for name, value in of.items()]
-    asked = [] if found.settings is None else [*found.settings.instrument]
-    return ", ".join(dict.fromkeys([*asked, *stated]))
+    told = [() if found.settings is None else found.settings.instrument]
+    told += [one.instrument.listed() for one in drivers if one.instrument is not None]
+    return ", ".join(dict.fromkeys(itertools.chain.from_iterable(told)))
 
 
 def words(method: str) -> str:

@@ -65,6 +65,13 @@ def find(
     )
 
 
+def calibrations_of(found: StudyFits, study: Study, recording: Recording) -> tuple[str, ...]:
+    """Paths of the calibrations of a recording, by which `found.drivers` has its driver."""
+    if found.settings is not None and found.settings.driver:
+        return next(iter(found.drivers), ())  # the only driver, of another file
+    return recording.calibration or tuple(study.calibrations)
+
+
 def picture(found: StudyFits, study: Study, row: int, reason: str) -> Picture | None:
     """One measured and predicted pulse of a fit; None if its recording cannot be read."""
     path, fit = str(found.fits.labels["path"][row]), found.fits[row]
@@ -72,10 +79,8 @@ def picture(found: StudyFits, study: Study, row: int, reason: str) -> Picture | 
         recording = study[path]
     except (RecordingError, KeyError):
         return None
-    names = recording.calibration or tuple(study.calibrations)
-    if found.settings is not None and found.settings.driver:
-        names = next(iter(found.drivers), ())  # the only driver, of another file
     by_current = recording.cause == "current"  # the fit needs no driver then
+    names = calibrations_of(found, study, recording)
     driver = None if by_current else found.drivers.get(names)
     figure, why = _predicted(recording, fit, driver)
     elements = ", ".join(fit.elements)

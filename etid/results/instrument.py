@@ -105,6 +105,10 @@ class Instrument(eqx.Module):
         numbers = {name: float(np.asarray(of)) for name, of in told.items() if of is not None}
         return {name: of for name, of in numbers.items() if of}
 
+    def listed(self) -> tuple[str, ...]:
+        """The tolerances that are stated, such as `"gain 0.001"`."""
+        return tuple(f"{name} {value!r}" for name, value in self.stored().items())
+
     def text(self) -> str:
         """The text that `read` reads."""
         return " ".join(f"{name}={value!r}" for name, value in self.stored().items())
