@@ -4,6 +4,11 @@ Each study of `benchmarks.perturbed_study.undisturbed` gets errors that are draw
 tolerances, one kind at a time or all of them, in its calibration and in dry and damp skin; a drift
 changes all parts of the driver, independently. Printed is the coverage (with the targets of
 `benchmarks.coverage`) of fits behind a driver and of joint fits.
+
+With `--fault N` one kind at a time is exactly N tolerances wrong, up or down; only the record of
+the skin is late then. Printed is the part of the fits that report anything, beside that of the best
+test behind the usual driver (`benchmarks.visibility`). Left out are a wrong resistor, which is
+invisible, and a drift, which is not one error.
 """
 
 import argparse
@@ -14,9 +19,11 @@ import numpy as np
 
 import etid
 from benchmarks import perturbed_study as lab
+from benchmarks import visibility
 from benchmarks.coverage import JOINT, Draws, draw, targets
 from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS
+from benchmarks.rates import rate
 from benchmarks.runner import WORKERS, Target, each, option, report
 
 TRUTH = {path: dataclasses.astuple(skin) for path, skin in LOADS.items()}
@@ -31,6 +38,13 @@ SIZES = {  # [relative, F, s]
 }
 KINDS = {**{name: (name,) for name in SIZES}, "all": tuple(SIZES)}
 MODES = ("behind a driver", JOINT)
+# What one tolerance changes; with a wrong resistor all impedances change in proportion, unseen.
+SEEN_BY_BEST = {
+    "gain": visibility.gain(SIZES["gain"], True),
+    "crosstalk": visibility.crosstalk(SIZES["crosstalk"], True),
+    "capacitance": visibility.shunt(SIZES["capacitance"]),
+    "delay": None,
+}
 
 OPTIONS = (
     WORKERS,
@@ -38,13 +52,24 @@ OPTIONS = (
     option("--draws", default=200),
     option("--only", nargs="+", choices=KINDS, help="kinds of errors"),
     option("--mode", nargs="+", choices=MODES, default=MODES),
+    option("--fault", type=float, help="one error of so many tolerances"),
 )
 
 
-def study(number: int, snr_db: float, names: Sequence[str]) -> etid.Study:
-    """A calibration and two skins, by an instrument whose errors of these kinds are drawn."""
+def study(
+    number: int, snr_db: float, names: Sequence[str], fault: float | None = None
+) -> etid.Study:
+    """A calibration and two skins, by an instrument whose errors of these kinds are drawn.
+
+    A `fault` is a size that they have, in tolerances, up or down.
+    """
     rng = np.random.default_rng([number, *b"errors"])
-    drawn = {name: size * float(rng.standard_normal()) for name, size in SIZES.items()}
+
+    def normal() -> float:
+        drawn = float(rng.standard_normal())
+        return drawn if fault is None else fault * float(np.sign(drawn))
+
+    drawn = {name: size * normal() for name, size in SIZES.items()}
     error = {name: of if name in names else 0.0 for name, of in drawn.items()}
     of = lab.undisturbed(number, snr_db)
     of = lab.all_records(lab.out(gain=1 + error["gain"]))(of)
@@ -55,7 +80,10 @@ def study(number: int, snr_db: float, names: Sequence[str]) -> etid.Study:
         later = lab.drawn_driver(FIRST + number, SIZES["drift"], of.trials[0].out.driver)
         of = lab.trials(lab.both(driver=later))(of)
     if "delay" in names:
-        of = lab.all_records(lambda one: _after(one, SIZES["delay"] * rng.standard_normal()))(of)
+        some = lab.all_records if fault is None else lab.trials
+        if fault is not None:
+            of = lab.calibrations(lambda one: _after(one, 0.0))(of)
+        of = some(lambda one: _after(one, SIZES["delay"] * normal()))(of)
     records = [one.recording(number) for one in (*of.calibrations, *of.trials)]
     return etid.Study.from_recordings(records)
 
@@ -77,23 +105,40 @@ def fits_of(of: etid.Study, mode: str, instrument: etid.Instrument) -> Mapping[s
     return {path: etid.identify_skin(of[path], driver, throw=False) for path in TRUTH}
 
 
-def answers(number: int, snr_db: float, kind: str, mode: str) -> list[tuple]:
+def answers(
+    number: int, snr_db: float, kind: str, mode: str, fault: float | None = None
+) -> list[tuple]:
     """A row of `Draws` for each skin."""
     # A joint fit has no drift.
     names = [name for name in KINDS[kind] if not (mode == JOINT and name == "drift")]
     instrument = etid.Instrument(**{name: SIZES[name] for name in names})
-    fits = fits_of(study(number, snr_db, names), mode, instrument)
+    fits = fits_of(study(number, snr_db, names, fault), mode, instrument)
     return [draw(fits.get(path), true) for path, true in TRUTH.items()]
+
+
+def found(name: str, of: Draws, best: float) -> Target:
+    """The part of the fits that report anything, which is to be as large as that of the best."""
+    told = rate(of.verdicts != "successful", range(of.verdicts.size))
+    text = f"{told}, best test {best:.0%}"
+    return Target(f"{name}: found", told.rate, best, text=text, interval=(told.low, told.high))
 
 
 def main(arguments: argparse.Namespace) -> bool:
     asked: list[Target] = []
+    fault = arguments.fault
+    kinds = arguments.only or (KINDS if fault is None else SEEN_BY_BEST)
     for snr_db in arguments.snr_db:
-        for kind in arguments.only or KINDS:
+        for kind in kinds:
             for mode in arguments.mode if kind != "drift" else MODES[:1]:
                 numbers = range(FIRST, FIRST + arguments.draws)
-                tasks = [(number, snr_db, kind, mode) for number in numbers]
-                found = dict(each(answers, tasks, arguments.workers, "draw", "tolerances"))
-                for path, rows in zip(TRUTH, zip(*found.values(), strict=True), strict=True):
-                    asked += targets(f"{snr_db:g} dB, {kind}, {mode}, {path}", Draws.of(rows))
+                tasks = [(number, snr_db, kind, mode, fault) for number in numbers]
+                done = dict(each(answers, tasks, arguments.workers, "draw", "tolerances"))
+                for path, rows in zip(TRUTH, zip(*done.values(), strict=True), strict=True):
+                    name, of = f"{snr_db:g} dB, {kind}, {mode}, {path}", Draws.of(rows)
+                    if fault is None:
+                        asked += targets(name, of)
+                        continue
+                    change, delay = SEEN_BY_BEST[kind], SIZES["delay"]
+                    best = visibility.found(LOADS[path], snr_db, change, fault, delay)
+                    asked.append(found(name, of, best))
     return report(asked)

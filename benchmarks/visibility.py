@@ -28,6 +28,7 @@ from etid.simulation.transformer import SkinLoad, loading
 
 BAND = 0.4  # of the sample rate
 LIMIT = 3.0  # standard deviations; a test with this limit refuses one good recording of 370
+RARE = 3.89  # one of 10 000, as a study can bear of a test that is asked of every recording
 
 Gain = Complex[np.ndarray, " f"]
 
@@ -50,9 +51,9 @@ def gain(part: float, calibration: bool) -> Change:
     return lambda of: (part * of.gains[0], part * calibration * of.gains[1])
 
 
-def crosstalk(part: float) -> Change:
-    """V_out sees this part of V_th, with the skin only."""
-    return lambda of: (part, 0.0)
+def crosstalk(part: float, calibration: bool = False) -> Change:
+    """V_out sees this part of V_th, with the resistor as well or not."""
+    return lambda of: (part, part * calibration)
 
 
 def lowpass(corner: float) -> Change:
@@ -110,6 +111,28 @@ def information(
     q, _ = np.linalg.qr(b)
     rest = (a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)).reshape(-1, a.shape[-1])
     return 2 * np.real(np.conj(rest.T) @ rest)
+
+
+def found(
+    load: SkinLoad, snr_db: float, change: Change | None, times: float, delay: float = 0.0
+) -> float:
+    """Probability that the best test finds a fault of so many tolerances behind a skin.
+
+    `change` is that of one tolerance. Without one the record of the skin is late, and `delay` is
+    the tolerance of its delay and of that of the calibration [s]. Faults within the tolerance,
+    N(0, 1) in its units, are no finding: an estimate with the standard deviation s is N(0, 1 + s²)
+    then, and exceeds `RARE` of its own standard deviations in one recording of 10 000.
+    """
+    of = information(load, snr_db, BAND, *([change] if change else []), one_pulse=True)
+    if change:
+        variance = np.linalg.inv(of)[-1, -1]
+    else:
+        tolerance = 1e6 * delay  # [µs]
+        of[4, 4] += tolerance**-2
+        variance = np.linalg.inv(of)[3, 3] / tolerance**2
+    noise = scipy.stats.norm(times, np.sqrt(variance))
+    limit = RARE * np.sqrt(1 + variance)
+    return float(noise.sf(limit) + noise.cdf(-limit))
 
 
 def missed(load: SkinLoad, snr_db: float, change: Change) -> float:
