@@ -9,7 +9,7 @@ from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.pulse_train import find_pulses, lags_of, whole_lag
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
+from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from tests.skins import DAMP, DRY, off
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
@@ -19,7 +19,9 @@ LOADS = {"dry": DRY, "damp": DAMP, "resistor": etid.Resistor(21.62e3)}
 SIGMAS = 5.0  # one in 2 million for a normal error
 
 
-def simulate(late=0.0, sample_rate=200e3, seed=0, snr_db: float | None = 60.0, periods=3.0):
+def simulate(
+    late=0.0, sample_rate=200e3, seed=0, snr_db: float | None = 60.0, periods=3.0, **driver
+):
     """Records whose `v_out` is late by so many samples; a pulse begins at 40 % of a period."""
 
     def study(start):
@@ -30,6 +32,7 @@ def simulate(late=0.0, sample_rate=200e3, seed=0, snr_db: float | None = 60.0, p
             samples=round(periods * sample_rate / PULSE),
             start=start,
             snr_db=snr_db,
+            driver=TransformerDriver(**driver),
         ).simulate(seed)
 
     early, other = study(0.010), study(0.010 - late / sample_rate)
@@ -58,6 +61,15 @@ def test_opposite_polarity_and_lags_out_of_reach_are_misaligned():
     assert Inspected(record.replace(v_out=-record.v_out)).correlated is None
     for late in (450.0, -450.0):
         assert preflight(Inspected(simulate(late, periods=1.0)["damp"])) == "misaligned"
+
+
+@pytest.mark.parametrize("width", [2.5e-3, 1 / 120, 12e-3])
+def test_a_long_pulse_is_not_taken_for_one_of_the_other_polarity(width):
+    """Its two edges are alike but for their signs; at half a period, so are those of half of it."""
+    for seed in range(5):
+        record = simulate(50.3, seed=seed, width=width)["damp"]
+        assert abs(Inspected(record).correlated - 50.3) < 1.0
+        assert Inspected(record.replace(v_out=-record.v_out)).correlated is None
 
 
 @pytest.mark.parametrize("late", [3, -120])

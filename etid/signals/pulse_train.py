@@ -327,7 +327,7 @@ def _within_a_sample(
 def lags_of(
     records: Float[np.ndarray, "recording 2 time"], trains: Sequence[PulseTrain]
 ) -> list[float | None]:
-    """Lag of `v_out` behind `v_th` of each recording, from the edges of one pulse.
+    """Lag of `v_out` behind `v_th` of each recording, from the edges of one period.
 
     The load smooths the edges. The lag found is therefore up to one sample too large.
 
@@ -347,7 +347,7 @@ def lags_of(
         alike.setdefault(_window(records[row, 0], train), []).append(row)
     for window, rows in alike.items():
         for row, lag in zip(rows, _lags(records, rows, window), strict=True):
-            lags[row] = float(lag) if abs(lag) <= min(400, _period(trains[row]) / 4) else None
+            lags[row] = float(lag) if abs(lag) <= window.largest else None
     return lags
 
 
@@ -359,33 +359,34 @@ class _Window(NamedTuple):
         last: Sample after the template, with the rise.
         reach: Largest lag that is searched [samples].
         rise: Samples over which edges rise.
+        largest: Largest lag that is accepted [samples].
     """
 
     first: int
     last: int
     reach: int
     rise: int
-
-
-def _period(train: PulseTrain) -> float:
-    return train.spacing or train.sample_rate / train.pulse_rate
+    largest: int
 
 
 def _window(v_th: Float[np.ndarray, " time"], train: PulseTrain) -> _Window:
-    """An eighth of a period around an edge of `v_th`, and half a period on both sides."""
-    period = _period(train)
+    """A period around an edge of `v_th`, and half a period on both sides.
+
+    With only one edge of a pulse, the other edge would look like this one with the wrong polarity.
+    """
+    period = train.spacing or train.sample_rate / train.pulse_rate
     rise, edges = rise_time(train.sample_rate), train.edges[train.edges < v_th.size]
     edge = int(edges[edges.size // 2] if edges.size else np.argmax(np.abs(rises(v_th, rise))))
-    around = int(period / 8)
+    around = int(period / 2)
     first, last = max(0, edge - around), min(edge + around + rise, v_th.size)
-    return _Window(first, last, int(period / 2), rise)
+    return _Window(first, last, around, rise, min(400, int(period / 4)))
 
 
 def _lags(
     records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int], window: _Window
 ) -> Float[np.ndarray, " row"]:
     """The lags with the highest correlation; infinite if the polarity is wrong."""
-    first, last, reach, rise = window
+    first, last, reach, rise, largest = window
     template = rises(records[rows, 0, first:last], rise)
     begin = first - reach
     start = max(0, begin)
@@ -398,7 +399,9 @@ def _lags(
     products = np.fft.irfft(transforms[:, 0] * np.conj(transforms[:, 1]), size)
     correlation = products[:, : 2 * reach + 1]
     lag = highest(correlation) - reach
-    return np.where(correlation.max(1) > -correlation.min(1), lag, np.inf)
+    # At half a period, pulses that last half of it have the other polarity.
+    accepted = correlation[:, reach - largest : reach + largest + 1]
+    return np.where(accepted.max(1) > -accepted.min(1), lag, np.inf)
 
 
 @functools.cache
