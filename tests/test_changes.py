@@ -14,6 +14,7 @@ from etid.recordings.preflight import Inspected
 from etid.recordings.repeats import repeats
 from etid.results.fits import Fits
 from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import TransformerDriver
 from tests import pictures
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
@@ -64,6 +65,15 @@ def change_of(of, scene, load, allowed=0.0):
 @pytest.fixture(scope="module")
 def driver():
     return etid.identify_driver(rung("dry").simulate(0)[CALIBRATION])
+
+
+@pytest.mark.parametrize("load", LOADS)
+@pytest.mark.parametrize("after", [0.1e-3, 0.3e-3, 0.5e-3, 0.8e-3])
+def test_nothing_changes_in_a_record_that_begins_in_a_pulse_or_on_its_tail(load, after):
+    """Cuts are up to half a sample beside their place, and the voltage is steep there."""
+    scene = dataclasses.replace(rung(load), start=TransformerDriver().lead_in + after)
+    for seed in range(5):
+        assert not change_of(trial(scene, seed), scene, LOADS[load]).seen
 
 
 @pytest.mark.parametrize("load", LOADS)

@@ -343,14 +343,19 @@ def _power(values: np.ndarray) -> np.ndarray:
 def _transforms(
     records: Sequence[Float[np.ndarray, "_"]], starts: Int[np.ndarray, "lane period"], layout: Bands
 ) -> np.ndarray:
-    """Harmonics of each period, without the mean of the record."""
+    """Harmonics of each period, without the line from its first sample to its last.
+
+    The line is that of the mean over the periods. A phase cannot rotate the ends of a period that
+    are not 0: in a pulse or on its tail, cuts beside their place would look like a change.
+    """
     # Single precision suffices, and the products with polynomials are faster.
     cut = np.zeros((*starts.shape, layout.size), np.float32)
     used = cut[..., : layout.length]  # the zeros after it make the transform fast
     for v, own, places in zip(records, used, starts.tolist(), strict=True):
         for period, start in zip(own, places, strict=True):
             period[:] = v[start : start + layout.length]
-    used -= used.mean((1, 2), keepdims=True)
+    first, last = used[..., [0, -1]].mean(1).T[..., None]
+    used -= (first + (last - first) * np.linspace(0, 1, layout.length))[:, None]
     return np.fft.rfft(cut)[:, :, 1 : layout.polynomials.shape[1] + 1]
 
 
