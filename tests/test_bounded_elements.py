@@ -77,6 +77,10 @@ def test_several_bounded_elements_are_those_of_draws_inside_the_box():
     assert not bool(found.contradicted)
     own = np.linalg.eigvalsh((found.cov - found.shared_cov) / np.outer(deviation, deviation))
     assert own.min() > 0
+    # R_s moves R_p with it, below 0.
+    far = within(circuit, jnp.asarray(cov), jnp.asarray(cov), (("r_s", 500e3, np.inf),))
+    assert np.isnan(far.values).all()
+    assert bool(far.contradicted)
 
 
 @pytest.mark.parametrize("from_bound", [0.0, 1.0, 4.0])

@@ -209,6 +209,7 @@ def test_known_elements_of_batches_and_on_the_command_line(skin, tmp_path, capsy
     [
         (lambda one: {"current": 1e3 * one.current}, "wrong_unit", "in ampere and not in mA"),
         (lambda one: {"current": one.v_out, "v_out": one.current}, "wrong_unit", "exchanged"),
+        (lambda one: {"v_out": 1e3 * one.v_out}, "wrong_unit", "v_out in volt"),
         (lambda one: {"current": 0 * one.current}, "flat", "is in current"),
         (lambda one: {"v_out": 0 * one.v_out}, "flat", "is in v_out"),
         (lambda one: {"current": -one.current}, "misaligned", "change the sign"),

@@ -111,13 +111,14 @@ def within(
         return jnp.where(sound, matrix * jnp.outer(scale, scale), jnp.nan)
 
     limit = scipy.special.chdtri(rows.size, scipy.special.chdtrc(1, CONTRADICTED))
+    nearest = _nearest(some[rows], low, high)
     return Within(
         values=jnp.where(sound, values, jnp.nan),
         cov=scaled(step @ whole),
         shared_cov=scaled(step @ (shared_cov / jnp.outer(scale, scale)) @ step.T),
         outside=jnp.zeros_like(free).at[rows].set(-jnp.clip(0.0, low, high)),
-        deviance=_nearest(some[rows], low, high),
-        contradicted=sound & (u @ some[rows] @ u > limit),
+        deviance=nearest,
+        contradicted=jnp.where(sound, u @ some[rows] @ u, nearest) > limit,
     )
 
 

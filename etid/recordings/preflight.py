@@ -256,10 +256,10 @@ def _is_implausible(inspected: Inspected) -> bool:
 def is_plausible(voltage: float, current: float) -> bool:
     """Whether the peak-to-peak v_out [V] and current [A] are those of a load at an electrode.
 
-    Stimulators of nerves and skin stay below 0.1 A in each direction. Electrodes in saline have
-    100 Ω, patches of membrane in a pipette 10 GΩ.
+    Stimulators of nerves and skin stay below 0.1 A and 500 V in each direction. Electrodes in
+    saline have 100 Ω, patches of membrane in a pipette 10 GΩ.
     """
-    return bool(current <= 0.25 and 1.0 <= voltage / current <= 1e12)
+    return bool(current <= 0.25 and voltage <= 2e3 and 1.0 <= voltage / current <= 1e12)
 
 
 def _is_misaligned(inspected: Inspected) -> bool:

@@ -23,6 +23,7 @@ from etid.results.verdicts import RESULTS, Judged, counted, message
 from etid.signals.transfer import power
 
 CHANGES = 9  # changes that the score tests try: a spread, seven relaxations, a gain
+DOUBTFUL = ("misfit", "inconsistent", "max_steps_reached")  # wrong known elements cause them
 SEEN = 3.0  # standard deviations; below, the residual does not look like any of the changes
 SURE = 5.0  # standard deviations of a change of the circuit that is no chance
 _SLOW, _FAST = 2, 3  # number of relaxations at either end of the band
@@ -351,11 +352,7 @@ class Fit(Judged, HasSource[Circuit]):
     def missed(self) -> str:
         """A sentence on the test that a `misfit` has failed, with its size; for one fit."""
         looks = "" if self.support is None else self.support.looks_like()
-        size = f"chi2 is {float(self.chi2):.3g}; noise alone gives 1."
-        told = without_known(self.method, self.circuit.units())[1]
-        return " ".join(
-            filter(None, (looks or size, told and "Is what was told right, and in SI units?"))
-        )
+        return looks or f"chi2 is {float(self.chi2):.3g}; noise alone gives 1."
 
     @property
     def other_circuit(self) -> str:
@@ -376,7 +373,9 @@ class Fit(Judged, HasSource[Circuit]):
     def _reasons(self) -> list[str]:
         said = {"changed": "changes", "misfit": "missed", "out_of_bounds": "outside"}
         own = getattr(self, said.get(self.verdict, ""), "")
-        return [*filter(None, (self.other_circuit, message(self.verdict), own))]
+        told = without_known(self.method, self.circuit.units())[1] and self.verdict in DOUBTFUL
+        doubt = "Is what was told right, and in SI units?" if told else ""
+        return [*filter(None, (self.other_circuit, message(self.verdict), own, doubt))]
 
     def _overview(self) -> Overview:
         kind, verdict = type(self.circuit).__name__, self.verdict

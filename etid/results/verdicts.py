@@ -65,7 +65,7 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "set `plausible` [ohm]."
     )
     wrong_unit = (
-        "The current, or v_out divided by it, has no size that a load at an electrode can have. "
+        "The current, v_out, or their ratio has no size that a load at an electrode can have. "
         "Give the current in ampere and not in mA, and v_out in volt. Or are the two exchanged?"
     )
     unconnected = (
