@@ -169,6 +169,7 @@ etid.identify_driver(of.calibration, instrument=1e-3) -> instrument
 [RecordingError]
 etid.identify_skin(of.alone, circuit=etid.SkinCurrent()) -> identify_amplitudes
 etid.identify_amplitudes([]) -> is empty
+etid.identify_amplitudes([of.alone]) -> one amplitude.*second
 etid.identify_amplitudes([of.alone, of.short]) -> recordings\[1\].*9000 samples
 etid.identify_skin(of.skin) -> current: was not recorded
 of.alone.v_th -> v_th: was not recorded

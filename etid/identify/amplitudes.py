@@ -30,6 +30,7 @@ from etid.identify.planning import failed_fit
 from etid.identify.skins import successful
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
+from etid.recordings.errors import RecordingError
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver, HarmonicDriver
@@ -45,6 +46,7 @@ UNEXPLAINED = 4.0
 # RRSE from which on it is a misfit, whatever χ² is. At an absurdly large gain the noise of V_th
 # would explain any residual: 1, 3 and 5 mA with one seed ended at χ² 0.26 and RRSE 0.78.
 LEFT = 0.5
+SAME = 1.1  # factor up to which amplitudes count as one
 register_description(
     METHOD,
     description(
@@ -117,7 +119,8 @@ def identify_amplitudes(
 
     Raises:
         RecordingError: There is no recording, one is given twice, the recordings have different
-            lengths or rates, or they lack V_th or the current.
+            lengths or rates, they lack V_th or the current, or all have one amplitude and the load
+            depends on its current.
         ValueError: The driver was identified by another method, or the circuit has several
             resistors that depend on their current.
         IdentificationError: The verdict is not successful and `throw` is set.
@@ -142,6 +145,14 @@ def identify_amplitudes(
         if name is not None:
             fit = failed_fit(name, options, METHOD)
             return successful(one.recording, fit) if throw else fit
+    free = {name for name, unit in load.units().items() if unit == "ampere"}
+    spans = [float(one.spans[0]) for one in seen]
+    if free.difference(name for name, *_ in options.known) and max(spans) < SAME * min(spans):
+        raise RecordingError(
+            "have one amplitude, and a load that depends on its current needs a second one",
+            field="recordings",
+            remedy="Add a recording with a fifth of the amplitude, or fix the current I_0",
+        )
     lanes = [Harmonics.of(one) for one in seen]
     known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
     fit = jax.device_get(_fit(stacked(lanes), known, feed, load, of_elements, options.bounds))
