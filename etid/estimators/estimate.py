@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -93,7 +94,7 @@ class Prior(eqx.Module):
         """The residuals and their derivatives."""
         z_th, slopes = self._source(parameters).with_slopes(self.frequency)
         by_resistance = jnp.where(z_th.real[None, :] < 0, slopes.real, 0.0)
-        rows = [jnp.diag(1 / self.width), by_resistance / self.unit]
+        rows = [np.eye(self.width.size) / self.width[None], by_resistance / self.unit]
         return self._terms(parameters, z_th), jnp.concatenate(rows, axis=1)
 
     def _terms(
@@ -125,29 +126,30 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     it. Otherwise the loaded driver would oscillate with some skins. Each frequency with Re Z_th < 0
     adds the residual Re Z_th / (10⁻³ R_L).
     """
-    half = 0.5 * jnp.pi * sample_rate
-    wide = 10 * r_load
     pairs, reals = start.log_omega.shape[0], start.log_omega_real.shape[0]
-    first = jnp.zeros(pairs).at[:1].set(1.0)
-    centre = SourceImpedance(
-        log_resistance=jnp.log(0.01 * r_load),
-        log_omega=jnp.log(half) + (1 - first) * math.log(3.0),
-        log_zeta=first * math.log(0.7) + (1 - first) * math.log(1.5),
-        gain=jnp.zeros(pairs),
-        slope=jnp.zeros(pairs),
-        log_omega_real=jnp.full(reals, jnp.log(half)).at[0].add(-math.log(500.0)),
-        gain_real=jnp.zeros(reals),
+    first, slow = np.arange(pairs) == 0, np.arange(reals) == 0
+
+    def flat(
+        resistance: float = 0.0,
+        omega: Any = 0.0,
+        zeta: Any = 0.0,
+        gain: float = 0.0,
+        real: Any = 0.0,
+    ) -> Float[np.ndarray, " parameter"]:
+        """Numbers in field order; as constants of NumPy, no program computes them."""
+        of_pairs = [np.broadcast_to(one, pairs) for one in (omega, zeta, gain, gain)]
+        of_reals = [np.broadcast_to(one, reals) for one in (real, gain)]
+        return np.concatenate([[resistance], *of_pairs, *of_reals])
+
+    centre = flat(
+        omega=np.where(first, 0.0, math.log(3.0)),
+        zeta=np.log(np.where(first, 0.7, 1.5)),
+        real=np.where(slow, -math.log(500.0), 0.0),
     )
-    width = SourceImpedance(
-        log_resistance=jnp.array(3.0),
-        log_omega=1.5 + 1.5 * first,
-        log_zeta=0.5 + first,
-        gain=jnp.full(pairs, wide),
-        slope=jnp.full(pairs, wide),
-        log_omega_real=jnp.full(reals, 3.0),
-        gain_real=jnp.full(reals, wide),
-    )
-    centre, width = ravel_pytree(centre)[0], ravel_pytree(width)[0]
+    centre = centre + flat(omega=1.0, real=1.0) * jnp.log(0.5 * jnp.pi * sample_rate)
+    centre = centre + flat(resistance=1.0) * jnp.log(0.01 * r_load)
+    width = flat(3.0, np.where(first, 3.0, 1.5), np.where(first, 1.5, 0.5), real=3.0)
+    width = width + flat(gain=10.0) * r_load
     frequency = jnp.asarray(PASSIVE_BAND) * sample_rate
     return Prior(start, centre, width, frequency, 1e-3 * r_load)
 

@@ -42,6 +42,12 @@ class _Group:
     def end(self) -> int:
         return self.first + self.width * self.count
 
+    @property
+    def shares(self) -> Float[np.ndarray, "width 2"]:
+        """Shares of the left and of the right knot in each harmonic of an interval."""
+        share = np.arange(self.width) / self.width
+        return np.stack([1 - share, share], axis=1)
+
 
 @dataclasses.dataclass(frozen=True)
 class Knots:
@@ -61,32 +67,32 @@ class Knots:
 
     def summed(self, values: Inexact[Array, "*row harmonic"]) -> Inexact[Array, "*row knot"]:
         """Σ_k φ_b(k) v_k for each knot b."""
-        before, after = [], []
+        rows, pairs = values.shape[:-1], []
         for group in self.groups:
-            part = values[..., group.first : group.end]
-            part = part.reshape(*part.shape[:-1], group.count, group.width)
-            share = _shares(group, part)
-            after.append((part * share).sum(-1))
-            before.append((part * (1 - share)).sum(-1))
-        last, none = values[..., -1:], jnp.zeros_like(values[..., :1])
-        return jnp.concatenate([*before, last], -1) + jnp.concatenate([none, *after], -1)
+            part = jax.lax.slice_in_dim(values, group.first, group.end, axis=-1)
+            part = part.reshape(*rows, group.count, group.width)
+            pairs.append(_product(part, group.shares.astype(values.dtype)))
+        left, right = jnp.unstack(jnp.concatenate(pairs, axis=-2), axis=-1)
+        last, none = values[..., -1:], np.zeros((*rows, 1), values.dtype)
+        return jnp.concatenate([left, last], -1) + jnp.concatenate([none, right], -1)
 
     def between(self, values: Inexact[Array, "*row knot"]) -> Inexact[Array, "*row harmonic"]:
         """Values at all harmonics, on straight lines between the knots."""
-        parts, knot = [], 0
+        rows, parts, knot = values.shape[:-1], [], 0
+        pairs = jnp.stack([values[..., :-1], values[..., 1:]], axis=-1)
         for group in self.groups:
-            ends = values[..., knot : knot + group.count + 1, None]
-            left, right = ends[..., :-1, :], ends[..., 1:, :]
-            line = left + (right - left) * _shares(group, left)
-            parts.append(line.reshape(*line.shape[:-2], -1))
+            ends = jax.lax.slice_in_dim(pairs, knot, knot + group.count, axis=-2)
+            line = _product(ends, group.shares.T.astype(values.dtype))
+            parts.append(line.reshape(*rows, group.count * group.width))
             knot += group.count
         return jnp.concatenate([*parts, values[..., -1:]], -1)
 
 
-def _shares(group: _Group, values: Inexact[Array, "*row interval _"]) -> Inexact[np.ndarray, "..."]:
-    """Share of the right knot in each harmonic of the intervals, with the axes of `values`."""
-    share = np.arange(group.width, dtype=values.dtype) / group.width
-    return share.reshape((1,) * (values.ndim - 1) + share.shape)
+def _product(
+    values: Inexact[Array, "*row interval n"], matrix: Inexact[np.ndarray, "n m"]
+) -> Inexact[Array, "*row interval m"]:
+    """The product with a matrix; an operation of `lax` is traced in a fifth of the time."""
+    return jax.lax.dot_general(values, matrix, (((values.ndim - 1,), (0,)), ((), ())))
 
 
 @functools.lru_cache(maxsize=16)

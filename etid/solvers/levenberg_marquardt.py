@@ -26,9 +26,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from etid.solvers.matrices import diagonal
 
 RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
 ROUNDING = 4.0  # rounding error of the model [ε]
@@ -67,12 +70,12 @@ class NormalEquations(eqx.Module):
 
     def step(self, damping: Float[Array, ""]) -> Float[Array, " parameter"]:
         """−(JᵀJ + damping · I)⁻¹ Jᵀr; not finite if this matrix is not positive definite."""
-        damped = self.matrix + damping * jnp.eye(self.gradient.size)
+        damped = self.matrix + damping * np.eye(self.gradient.size)
         return -cho_solve(cho_factor(damped), self.gradient)
 
     def newton(self) -> Float[Array, " parameter"]:
         """The step without damping; directions without effect take no part."""
-        scale = jnp.sqrt(jnp.diagonal(self.matrix))
+        scale = jnp.sqrt(diagonal(self.matrix))
         scale = jnp.where(scale > 0, scale, 1.0)
         return self.scaled(scale).step(jnp.asarray(RIDGE, scale.dtype)) / scale
 
@@ -251,8 +254,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         idle = jnp.where(accept, idle, state.idle)
         accepted = _select(accept, trial, state.accepted)
         y = jnp.where(accept, state.y_eval, y)
-        diagonal = jnp.sqrt(jnp.diagonal(accepted.matrix))
-        scale = jnp.maximum(state.scale, diagonal)
+        sizes = jnp.sqrt(diagonal(accepted.matrix))
+        scale = jnp.maximum(state.scale, sizes)
         safe = jnp.where(scale > 0, scale, 1.0)
 
         # The step is solved in z = D y.
@@ -270,7 +273,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         converged = offset <= self.rtol**2 * squares
         # The rounding error of the residual is ε times the model, which is about |J y|. A reduction
         # of |r|² below |r| times this error is invisible, and a rejected step then means nothing.
-        model = self.norm(diagonal * y)
+        model = self.norm(sizes * y)
         unseen = offset <= ROUNDING * jnp.finfo(y.dtype).eps * jnp.sqrt(squares) * model
         converged = converged | (unseen & ~accept)
         converged = converged | (idle >= IDLE_STEPS) | (self.norm(newton) <= self.atol * size)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 SMALLEST = 1e-12  # eigenvalue of a scaled matrix; double precision resolves no smaller one
@@ -52,6 +53,11 @@ def inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jax.scipy.linalg.solve_triangular(factor, jnp.diag(1 / scale), lower=True).T
 
 
+def diagonal(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
+    """The diagonal of a matrix; `jnp.diagonal` is traced as twenty operations."""
+    return jnp.where(np.eye(matrix.shape[0], dtype=bool), matrix, 0.0).sum(1)
+
+
 def log_stderr(
     response: Callable[[Float[Array, " parameter"]], Complex[Array, " frequency"]],
     values: Float[Array, " parameter"],
@@ -76,7 +82,7 @@ def _unit_diagonal(
     matrix: Float[Array, "n n"],
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """D⁻¹ M D⁻¹ and the diagonal of D, which is 1 where the diagonal of M is not positive."""
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
+    scale = jnp.sqrt(jnp.maximum(diagonal(matrix), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)
     return matrix / scale[:, None] / scale[None, :], scale
 
@@ -84,4 +90,4 @@ def _unit_diagonal(
 def _factor(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """Cholesky factor of D⁻¹ M D⁻¹ with a ridge for directions without information, and D."""
     scaled, scale = _unit_diagonal(matrix)
-    return jax.scipy.linalg.cholesky(scaled + SMALLEST * jnp.eye(scale.size), lower=True), scale
+    return jax.scipy.linalg.cholesky(scaled + SMALLEST * np.eye(scale.size), lower=True), scale

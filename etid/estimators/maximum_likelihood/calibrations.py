@@ -9,6 +9,7 @@ are condensed (`etid.estimators.maximum_likelihood.condensed`).
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
@@ -137,10 +138,10 @@ class Calibrations(eqx.Module):
         """The gains, and their derivatives with respect to Z_th and to the errors."""
         r_load = self.calibration.r_load
         known = resistance = as_complex(r_load)[:, None]
-        # Records with equal values are of one resistor: they have the error of the first of them.
-        first = jnp.argmax(r_load[:, None] == r_load[None], axis=1)
-        off = as_complex(self.tolerances * self.errors(common))
         if self.instrument is not None:
+            # Records with equal values are of one resistor: they have the error of the first.
+            first = jnp.argmax(r_load[:, None] == r_load[None], axis=1)
+            off = as_complex(self.tolerances * self.errors(common))
             resistance = known * (1 + off[-known.size :][first, None])
         loop, late = reciprocal(resistance + z_th), self.named(common).delay_samples
         gains = jax.vmap(delayed, (0, 0, 0, None))(resistance * loop, f, late, self.rate)
@@ -163,7 +164,7 @@ class Calibrations(eqx.Module):
         z_th, by_source = jax.vmap(self.source_of(common).with_slopes, out_axes=(0, 1))(f)
         gains, by_z, by_error = self._gains(common, f, z_th)
         by_delay = -gains * frequency_variable(f / self.rate)
-        alone = as_complex(jnp.eye(f.shape[0]))[:, :, None]
+        alone = np.eye(f.shape[0], dtype=complex)[:, :, None]
         rows = [by_source * by_z[None], alone * by_delay[None], by_error]
         return Slopes(z_th, gains, by_z, jnp.concatenate(rows))
 
@@ -205,12 +206,12 @@ class Calibrations(eqx.Module):
     ) -> tuple[Float[Array, " term"], Float[Array, "common term"]]:
         """The terms of the weak priors and their derivatives."""
         of = self.named(common)
-        late = jnp.eye(of.delay_samples.size) / self.delay_width
+        late = np.eye(of.delay_samples.size) / self.delay_width
         errors = self.errors(common)
         regular = prior(self.source, self.rate, self.calibration.r_load.mean())
         weak, by_source = regular.with_slopes(of.source)
         terms = [weak, of.delay_samples / self.delay_width, errors]
-        rows = jax.scipy.linalg.block_diag(by_source, late, jnp.eye(errors.size))
+        rows = jax.scipy.linalg.block_diag(by_source, late, np.eye(errors.size))
         return jnp.concatenate(terms), rows
 
     def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:

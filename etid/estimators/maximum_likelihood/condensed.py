@@ -19,6 +19,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.maximum_likelihood.profile import Profile, total
@@ -157,6 +158,6 @@ def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
     shapes = jax.eval_shape(once, q)
 
     def nothing(_) -> Any:
-        return jax.tree.map(lambda of: jnp.full(of.shape, jnp.nan, of.dtype), shapes)
+        return jax.tree.map(lambda of: jax.lax.full(of.shape, np.nan, of.dtype), shapes)
 
     return jax.lax.cond(jnp.isfinite(q).all(), once, nothing, q)

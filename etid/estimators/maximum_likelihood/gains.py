@@ -17,6 +17,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
@@ -121,15 +122,15 @@ class Gains(eqx.Module):
 
     def centre(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Prior means of the parameters."""
-        own = jnp.zeros(self.elements) if self.prior is None else self.prior.centre
-        return jnp.concatenate([own, jnp.zeros(self.outputs), self.driver.mean])[: q.size]
+        own = np.zeros(self.elements) if self.prior is None else self.prior.centre
+        return jnp.concatenate([own, np.zeros(self.outputs), self.driver.mean])[: q.size]
 
     def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Prior standard deviations of the parameters."""
-        own = jnp.full(self.elements, jnp.inf) if self.prior is None else self.prior.width
+        own = np.full(self.elements, np.inf) if self.prior is None else self.prior.width
         # How little the delays of V_out scatter tells nothing about those of the current.
-        delays = jnp.full(self.outputs, DELAY_WIDTH).at[0].set(self.driver.delay_width)
-        return jnp.concatenate([own, delays, jnp.ones_like(self.driver.mean)])[: q.size]
+        delays = self.driver.delay_width[None], np.full(self.outputs - 1, DELAY_WIDTH)
+        return jnp.concatenate([own, *delays, np.ones(self.driver.mean.size)])[: q.size]
 
     def at(self, every: Knots) -> "Gains":
         """The same at the knots of the harmonics."""
@@ -198,11 +199,11 @@ class Gains(eqx.Module):
             return self.circuit.with_log_values(logs).impedance()(s)
 
         z_load, one = load(logs), jnp.ones_like(s)
-        by_element = jax.vmap(lambda way: jax.jvp(load, (logs,), (way,))[1])(jnp.eye(logs.size))
+        by_element = jax.vmap(lambda way: jax.jvp(load, (logs,), (way,))[1])(np.eye(logs.size))
         value, by_load = jax.jvp(lambda at: self._undelayed(at, w, faults), (z_load,), (one,))
         by_w = jax.jvp(lambda at: self._undelayed(z_load, at, faults), (w,), (one,))[1]
         value, by_load, by_w = (self.turned(q, of, self.frequency) for of in (value, by_load, by_w))
-        alone = as_complex(jnp.eye(self.outputs))[:, :, None]
+        alone = np.eye(self.outputs, dtype=complex)[:, :, None]
         rows = [
             by_element[:, None] * by_load[None],
             alone * ((-s * as_complex(1 / self.sample_rate))[None, :] * value)[None],

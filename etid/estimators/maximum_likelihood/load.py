@@ -11,6 +11,7 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
@@ -129,7 +130,7 @@ def changes(load: Load, near: Near) -> Complex[Array, "change output knot"]:
     """
     frequency = load.knots.at(load.gains.frequency)
     _, circuits = other_circuit.changes(load.gains.impedance(near.q), frequency)
-    alone = as_complex(jnp.eye(load.gains.outputs))[:, :, None]
+    alone = np.eye(load.gains.outputs, dtype=complex)[:, :, None]
     scales = alone * near.slopes.gains[None]
     return jnp.concatenate([circuits[:, None] * near.slopes.by_z[None], scales])
 

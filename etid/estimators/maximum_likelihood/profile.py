@@ -22,6 +22,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.results.fit import complex_rrse
@@ -142,8 +143,9 @@ class Profile(eqx.Module):
     def information(self) -> Complex[Array, "output output harmonic"]:
         """P."""
         outputs, harmonics = self.gains.shape
-        unit = jnp.tile(as_complex(jnp.eye(outputs))[:, :, None], (1, 1, harmonics))
-        columns = jnp.stack([self.weighted(self.whitened(one)) for one in unit], axis=1)
+        unit = np.eye(outputs, dtype=complex)[:, :, None]
+        each = [jnp.broadcast_to(one, (outputs, harmonics)) for one in unit]
+        columns = jnp.stack([self.weighted(self.whitened(one)) for one in each], axis=1)
         return columns * as_complex(power(self.x))[None, None, :]
 
     @property
