@@ -31,6 +31,9 @@ UNDISTURBED: Mapping[str, Change] = {
     "base_six_periods": lab.lasting(SIX),
     "base_two_resistors": lab.second_resistor(1.0),
     "base_whole_samples_per_period": lab.coherent(),
+    "base_begins_in_a_pulse": lab.beginning(0.3e-3),
+    "base_begins_on_the_tail_of_a_pulse": lab.beginning(0.8e-3),
+    "base_pulses_of_4_ms": lab.wide(4e-3),
 }
 """Studies in which all is well: hardly any of them may be refused."""
 

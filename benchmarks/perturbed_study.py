@@ -206,6 +206,16 @@ def on_edge(of: Record) -> Record:
     return _later(of, driver.lead_in + driver.edge / 2, pulses=pulses, over=PERIODS)
 
 
+def beginning(after: float) -> Change:
+    """Begin all records so much [s] after the start of a pulse."""
+    return all_records(lambda of: _later(of, -of.th.driver.lead_in - after))
+
+
+def wide(width: float) -> Change:
+    """Let all pulses last so long [s]."""
+    return all_records(lambda of: both(driver=dataclasses.replace(of.th.driver, width=width))(of))
+
+
 def second_resistor(factor: float) -> Change:
     """Calibrate with a second resistor, which is not what the file says by this factor."""
 
