@@ -141,15 +141,15 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
         of_reals = [np.broadcast_to(one, reals) for one in (real, gain)]
         return np.concatenate([[resistance], *of_pairs, *of_reals])
 
-    centre = flat(
+    centre = jnp.log(0.01 * r_load) * flat(resistance=1.0)
+    centre = centre + jnp.log(0.5 * jnp.pi * sample_rate) * flat(omega=1.0, real=1.0)
+    centre = centre + flat(
         omega=np.where(first, 0.0, math.log(3.0)),
         zeta=np.log(np.where(first, 0.7, 1.5)),
         real=np.where(slow, -math.log(500.0), 0.0),
     )
-    centre = centre + flat(omega=1.0, real=1.0) * jnp.log(0.5 * jnp.pi * sample_rate)
-    centre = centre + flat(resistance=1.0) * jnp.log(0.01 * r_load)
     width = flat(3.0, np.where(first, 3.0, 1.5), np.where(first, 1.5, 0.5), real=3.0)
-    width = width + flat(gain=10.0) * r_load
+    width = r_load * flat(gain=10.0) + width
     frequency = jnp.asarray(PASSIVE_BAND) * sample_rate
     return Prior(start, centre, width, frequency, 1e-3 * r_load)
 

@@ -68,7 +68,7 @@ class Knots:
     def summed(self, values: Inexact[Array, "*row harmonic"]) -> Inexact[Array, "*row knot"]:
         """Σ_k φ_b(k) v_k for each knot b."""
         rows = values.shape[:-1]
-        pairs = [np.zeros((*rows, 0, 2), values.dtype)]  # a single harmonic has no interval
+        pairs = [jnp.zeros((*rows, 0, 2), values.dtype)]  # a single harmonic has no interval
         for group in self.groups:
             part = jax.lax.slice_in_dim(values, group.first, group.end, axis=-1)
             part = part.reshape(*rows, group.count, group.width)

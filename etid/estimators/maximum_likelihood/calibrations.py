@@ -138,10 +138,10 @@ class Calibrations(eqx.Module):
         """The gains, and their derivatives with respect to Z_th and to the errors."""
         r_load = self.calibration.r_load
         known = resistance = as_complex(r_load)[:, None]
+        # Records with equal values are of one resistor: they have the error of the first of them.
+        first = jnp.argmax(r_load[:, None] == r_load[None], axis=1)
+        off = as_complex(self.tolerances * self.errors(common))
         if self.instrument is not None:
-            # Records with equal values are of one resistor: they have the error of the first.
-            first = jnp.argmax(r_load[:, None] == r_load[None], axis=1)
-            off = as_complex(self.tolerances * self.errors(common))
             resistance = known * (1 + off[-known.size :][first, None])
         loop, late = reciprocal(resistance + z_th), self.named(common).delay_samples
         gains = jax.vmap(delayed, (0, 0, 0, None))(resistance * loop, f, late, self.rate)
