@@ -80,10 +80,12 @@ def study(
         later = lab.drawn_driver(FIRST + number, SIZES["drift"], of.trials[0].out.driver)
         of = lab.trials(lab.both(driver=later))(of)
     if "delay" in names:
-        some = lab.all_records if fault is None else lab.trials
-        if fault is not None:
-            of = lab.calibrations(lambda one: _after(one, 0.0))(of)
-        of = some(lambda one: _after(one, SIZES["delay"] * normal()))(of)
+
+        def late(one: Record) -> Record:
+            right = fault is not None and one.r_load is not None
+            return _after(one, 0.0 if right else SIZES["delay"] * normal())
+
+        of = lab.all_records(late)(of)
     records = [one.recording(number) for one in (*of.calibrations, *of.trials)]
     return etid.Study.from_recordings(records)
 
@@ -126,9 +128,9 @@ def found(name: str, of: Draws, best: float) -> Target:
 def main(arguments: argparse.Namespace) -> bool:
     asked: list[Target] = []
     fault = arguments.fault
-    kinds = arguments.only or (KINDS if fault is None else SEEN_BY_BEST)
+    possible = KINDS if fault is None else SEEN_BY_BEST
     for snr_db in arguments.snr_db:
-        for kind in kinds:
+        for kind in filter(possible.__contains__, arguments.only or possible):
             for mode in arguments.mode if kind != "drift" else MODES[:1]:
                 numbers = range(FIRST, FIRST + arguments.draws)
                 tasks = [(number, snr_db, kind, mode, fault) for number in numbers]

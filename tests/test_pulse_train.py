@@ -10,7 +10,7 @@ from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.pulse_train import fast_length, find_pulses
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.simulation.transformer import SkinLoad
 
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
 PULSE = 60.0
@@ -19,7 +19,6 @@ PULSE = 60.0
 def simulate(sample_rate=200e3, periods=3.0, seed=1, **options):
     scene = Scene(
         (Trial("a", DAMP),),
-        (Trial("98k8", ResistorLoad(98.8e3)),),
         sample_rate=sample_rate,
         samples=int(periods * sample_rate / PULSE) + 1,
         **options,
@@ -64,15 +63,15 @@ def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
         np.testing.assert_allclose(found, right[::-1], rtol=2 * PULSE / rate)
 
 
+@pytest.mark.parametrize("sample_rate", [100e3, 500e3])
 @pytest.mark.parametrize(
-    ("sample_rate", "ppm", "snr_db", "refused"),
+    ("ppm", "snr_db", "refused"),
     [
-        (100e3, 20.0, None, True),
-        (100e3, -20.0, 60.0, True),
-        (100e3, 300.0, 40.0, True),  # a sample and more, as if some were lost
-        (100e3, 5.0, 60.0, False),
-        (100e3, 20.0, 20.0, False),
-        (500e3, 20.0, 60.0, True),
+        (20.0, None, True),
+        (-20.0, 60.0, True),
+        (300.0, 40.0, True),  # a sample and more, as if some were lost
+        (5.0, 60.0, False),
+        (20.0, 20.0, False),
     ],
 )
 def test_two_records_with_different_clocks_are_a_mismatch(sample_rate, ppm, snr_db, refused):

@@ -145,9 +145,9 @@ def identify_amplitudes(
         if name is not None:
             fit = failed_fit(name, options, METHOD)
             return successful(one.recording, fit) if throw else fit
-    free = {name for name, unit in load.units().items() if unit == "ampere"}
+    free = set(np.array(load.names())[currents(load)]).difference(of for of, *_ in options.known)
     spans = [float(one.spans[0]) for one in seen]
-    if free.difference(name for name, *_ in options.known) and max(spans) < SAME * min(spans):
+    if free and max(spans) < SAME * min(spans):
         raise RecordingError(
             "have one amplitude, and a load that depends on its current needs a second one",
             field="recordings",

@@ -118,7 +118,7 @@ def approached(
         return _State(trial, best, near, objective, target, promised, settled, idle, points)
 
     near, objective = jax.tree.map(
-        lambda of: jax.lax.full(of.shape, 0, of.dtype), jax.eval_shape(evaluate, start)
+        lambda of: jnp.zeros(of.shape, of.dtype), jax.eval_shape(evaluate, start)
     )
     zero, none = jnp.zeros_like(objective), jnp.array(0)
     first = _State(start, start, near, objective, start, zero, jnp.array(False), none, none)
