@@ -370,16 +370,23 @@ class _Window(NamedTuple):
 
 
 def _window(v_th: Float[np.ndarray, " time"], train: PulseTrain) -> _Window:
-    """A period around an edge of `v_th`, and half a period on both sides.
+    """The pulse of `v_th` in the middle of a record, and half a period on both sides.
 
     With only one edge of a pulse, the other edge would look like this one with the wrong polarity.
+    Of a whole period, the noise beside the pulse would hide it at 10 dB.
     """
     period = train.spacing or train.sample_rate / train.pulse_rate
     rise, edges = rise_time(train.sample_rate), train.edges[train.edges < v_th.size]
     edge = int(edges[edges.size // 2] if edges.size else np.argmax(np.abs(rises(v_th, rise))))
-    around = int(period / 2)
-    first, last = max(0, edge - around), min(edge + around + rise, v_th.size)
-    return _Window(first, last, around, rise, min(400, int(period / 4)))
+    around, step = int(period / 2), _step(period)
+    begin = max(0, edge - around)
+    number = (min(edge + around, v_th.size) - begin) // step
+    coarse = v_th[begin : begin + number * step].reshape(number, step).mean(1)
+    coarse = np.abs(coarse - coarse.mean())
+    high = begin + step * np.flatnonzero(~(coarse < 0.5 * coarse.max()))
+    beside = 8 * step + 4 * rise
+    first, last = max(0, high[0] - beside), min(high[-1] + step + beside, v_th.size)
+    return _Window(int(first), int(last), around, rise, min(400, int(period / 4)))
 
 
 def _lags(
