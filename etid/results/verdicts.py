@@ -82,9 +82,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "three standard errors outside. Correct the bounds, or fit another circuit."
     )
     driver_unclear = (
-        "The calibrations are too noisy: this recording moves the source impedance further than "
-        "the fit can follow. Repeat them with more periods or a second resistor, or identify all "
-        "recordings together with identify_jointly."
+        "The calibrations leave the source impedance too uncertain: this recording moves it "
+        "further than the fit can follow, or has two solutions. Calibrate with a second resistor, "
+        "raise the sample rate, or state the delay of the instrument."
     )
     biased = (
         "Noise, aliases or a low sample rate shifted the estimate by several standard errors. Use "

@@ -30,6 +30,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
@@ -83,6 +84,7 @@ class GivenDriver(eqx.Module):
         delay_width: Prior standard deviation of the trigger delay of a load [samples].
         faults: Gain, crosstalk and capacitance at z = 0 and by z; None if the instrument has no
             tolerances.
+        aside: Distance of the first delay of a search from that of its start [samples].
         by_current: Whether the input is a measured current: the gain is Z_L, and there is no z.
     """
 
@@ -99,6 +101,7 @@ class GivenDriver(eqx.Module):
     shape: UnloadedShape | None = None
     delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
     faults: tuple[Float[Array, "3"], Float[Array, "z 3"]] | None = None
+    aside: Float[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     by_current: bool = eqx.field(static=True, default=False)
 
     @classmethod

@@ -65,13 +65,13 @@ class Found(NamedTuple):
 
 def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     """Identify the load of one recording from its best start; the likeliest is the last."""
-    driver = load.gains.driver
-    q, least = minimum(load, jnp.concatenate([best_start(load, candidates), driver.mean]))
+    driver, count, owned = load.gains.driver, load.gains.elements, load.gains.owned
+    start = best_start(load, candidates).at[count:].add(driver.aside)
+    q, least = minimum(load, jnp.concatenate([start, driver.mean]))
     # Standard errors and tests are those of the last point; they do not change in a short step.
     at, near, every = least.point, least.near, load.knots
     records = load.known(at)
     profile, condensed = near.profile, near.condensed
-    count, owned = load.gains.elements, load.gains.owned
     share, noise = signal_share(profile.x, records.variance_x), profile.excess(records)
     linear, own_noise = _linear(load, near, noise)
     prior = 1 / load.gains.widths(at) ** 2
