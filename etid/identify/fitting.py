@@ -33,6 +33,7 @@ from etid.estimators.lanes import (
     unstacked,
 )
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.identify import changes
 from etid.identify.second_minimum import ASIDE, likelier
 from etid.numpy_tier.tiers import program, worth_compiling
@@ -488,7 +489,7 @@ class Batch:
                 return taken(fits, np.arange(len(lanes)))  # without the padding
 
             found = fitted_with(known)
-            if known is None or not has_open_resonance(driver):
+            if not isinstance(known, GivenDriver) or not has_open_resonance(driver):
                 return found
             return likelier(found, fitted_with(dataclasses.replace(known, aside=np.asarray(ASIDE))))
 
