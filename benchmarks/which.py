@@ -44,7 +44,7 @@ def table(rows: Sequence[Row]) -> str:
         of = {row["estimator"]: row for row in rows if row["scene"] == scene}
         use = best(list(of.values()))
         cells = [_cell(of.get(method), method == use) for method in methods]
-        name = use.replace("_", " ") if use else "none of them"
+        name = use.replace("_", " ") if use else "-"
         lines.append(f"| {scene} | " + " | ".join(cells) + f" | {name} |")
     times, draws = [], []
     for of in (of_method[name] for name in methods):

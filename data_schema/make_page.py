@@ -105,12 +105,12 @@ in `loaded/finger`.
 |---|---|---|---|---|
 | `.csv` | columns, by the first line | units: `open [mV]`, or a second line of them | none | |
 | `.mat` | variables, `a.b` for field b of structure a | nothing | rows | |
-| `.tdms` | `group/channel` | units (`unit_string`), rate (`wf_increment`) | none | `etid[tdms]` |
-| `.abf` | ADC channels, or `channel 0`, … | units and rate | sweeps | `etid[abf]` |
+| `.tdms` | `group/channel` | units (`unit_string`), rate (`wf_increment`) | none | `.[tdms]` |
+| `.abf` | ADC channels, or `channel 0`, … | units and rate | sweeps | `.[abf]` |
 | `.npz` | arrays | nothing | rows | |
 | `.wav` | `1`, `2`, …, as fractions of full scale | rate | none | |
 | `.lvm` | columns of LabVIEW, one header per file | units, rate (`Delta_X`) | none | |
-| `.xlsx` | columns; further sheets `sheet/column` | units as in CSV | none | `etid[excel]` |
+| `.xlsx` | columns; further sheets `sheet/column` | units as in CSV | none | `.[excel]` |
 
 A table contains its rate if a preamble of an oscilloscope has a `Sample Interval` or an
 `Increment`. In all formats a name such as `open [mV]` contains a unit.
@@ -242,8 +242,9 @@ v_out = {channel = "channel 0", rows = [1, 2]}
 
 ### NumPy
 
-A `.npz` archive needs no mapping. It contains the converter codes `adc_th` and `adc_out` (trial,
-time) and `adc_ref` (resistor, time), and the numbers `R_ref`, `fs`, `f0`, `lsb` and `scale`.
+A `.npz` archive with these arrays needs no mapping: the converter codes `adc_th` and `adc_out`
+(trial, time) and `adc_ref` (resistor, time), and the numbers `R_ref`, `fs`, `f0`, `lsb` and
+`scale`. All calibrations then share the first row of `adc_th`.
 """
 
 

@@ -1,7 +1,7 @@
 """Parts of pages that are made from the code: `<!-- made: NAME -->` in a page.
 
-The table of verdicts comes from their messages, the command line from its parsers, and the
-reference from the names that `etid` exports.
+The tables of verdicts and remarks come from their messages, the command line from its parsers, and
+the reference from the names that `etid` exports.
 """
 
 import os
@@ -12,6 +12,7 @@ import optimistix as optx
 
 import etid
 from etid import cli
+from etid.recordings import remarks
 from etid.results import verdicts
 
 MARK = re.compile(r"^<!-- made: (\w+) -->$", re.MULTILINE)
@@ -34,6 +35,12 @@ def table_of_verdicts():
     said["successful"] = "The model explains the recording down to its noise."
     rows = [f"| `{name}` | {text} |" for name, text in said.items()]
     return "\n".join(["| verdict | what it says |", "|---|---|", *rows])
+
+
+def table_of_remarks():
+    """Table of all remarks and their sentences."""
+    rows = [f"| `{one.name}` | {remarks.texts(one)[0]} |" for one in remarks.Remark]
+    return "\n".join(["| remark | what it says |", "|---|---|", *rows])
 
 
 def commands():
@@ -79,4 +86,9 @@ def _package(named):
     return name.split(".")[1]
 
 
-MADE = {"verdicts": table_of_verdicts, "commands": commands, "reference": reference}
+MADE = {
+    "verdicts": table_of_verdicts,
+    "remarks": table_of_remarks,
+    "commands": commands,
+    "reference": reference,
+}
