@@ -149,15 +149,12 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     target = tmp_path / "fits.h5"
     status, printed, complaints = run("fit", study_file, "-o", target)
     assert (status, complaints) == (DONE, [])
-    verdicts = "3 successful, 1 nonfinite_samples, 1 unreadable"
-    assert printed[0] == f"5 recordings by maximum_likelihood: {verdicts}"
-    assert printed[1].startswith("driver calibration/98k8: order 5, successful, RRSE ")
-    heads, row = printed[4], printed[5]
-    assert heads.split() == "subject condition fits r_s [kΩ] r_p [kΩ] c_p [nF]".split()
-    assert row.split()[:3] == ["typical", "dry", "3/4"]
-    r_s, spread, error = (float(word.strip("(;)")) for word in row.split()[3:6])
-    assert abs(r_s - 33.4) < 5 * error  # five standard errors: 1 in 10⁶ by chance
-    assert 0 <= spread < 5 * error < r_s
+    assert printed[0] == "5 fits of SkinRC: 3 successful, 1 nonfinite_samples, 1 unreadable"
+    (row,) = (line.split() for line in printed if line.startswith("  typical dry"))
+    assert row[2] == "3/4"
+    r_s, error = float(row[3]), float(row[5])
+    assert abs(r_s - 33.4) < 5 * error < r_s  # five standard errors: 1 in 10⁶ by chance
+    assert any(line.split()[:3] == ["calibration/98k8", "5", "successful"] for line in printed)
     assert "without success: 2 recordings" in printed
     assert any(line.startswith("typical/dry/99: unreadable. ") for line in printed)
     assert any(line.startswith("typical/dry/02: nonfinite_samples. ") for line in printed)
@@ -203,8 +200,9 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, without_d
     target = tmp_path / "fits.h5"
     status, printed, _ = run("fit", without_driver, "-o", target)
     assert status == WRONG_DATA
-    assert printed[0] == "23 recordings by maximum_likelihood: 23 driver_failed"
-    assert printed[1].startswith("driver calibration/98k8: calibration 'calibration/98k8': flat.")
+    assert printed[0] == "23 fits of SkinRC: 23 driver_failed"
+    (driver,) = (line for line in printed if line.startswith("  calibration/98k8: "))
+    assert "calibration 'calibration/98k8': flat." in driver
     assert sum(line.startswith("  built/") for line in printed) == 20
     explained = [line for line in printed if line.startswith("driver_failed. ")]
     assert len(explained) == 1  # not once for each recording

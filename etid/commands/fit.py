@@ -3,7 +3,6 @@
 import argparse
 import concurrent.futures
 import contextlib
-import math
 import pathlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from etid.circuits.display import DISPLAY, heading, several, unexplained
+from etid.circuits.display import several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.commands.circuits import add_circuit
 from etid.estimators import registry
@@ -21,7 +20,6 @@ from etid.identify.jointly import identify_jointly
 from etid.recordings import hdf5
 from etid.recordings.errors import RecordingError, install
 from etid.recordings.replacing import HDF5, claimed
-from etid.report.html import Table
 from etid.results.driver import Order
 from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
@@ -234,25 +232,11 @@ def _executor(arguments: argparse.Namespace) -> Iterator[concurrent.futures.Exec
 
 
 def _summary(outcome: StudyFits) -> str:
-    """Text for people: verdicts, drivers, medians, and the recordings without success."""
+    """Text for people: the fits and drivers, and the recordings without success."""
     fits = outcome.fits
-    verdicts = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
-    lines = [f"{several(len(fits), 'recording')} by {fits.fit.method}: {verdicts}"]
-    for paths, driver in outcome.drivers.items():
-        text = (
-            f"order {driver.order}, {driver.verdict}, "
-            f"{unexplained(float(driver.rrse))}, chi2 {float(driver.chi2):.3g}"
-        )
-        lines.append(f"driver {', '.join(paths)}: {text}. {message(driver.verdict)}".rstrip(". "))
-    lines += [f"driver {', '.join(paths)}: {text}" for paths, text in outcome.failures.items()]
+    lines = [str(outcome)]
     if len(fits) == 1 and "successful" in fits.counts():
         lines += ["", str(fits[0])]
-    elif "successful" in fits.counts():
-        lines += [
-            "",
-            "medians of the successful fits (spread between recordings; median standard error)",
-            str(_medians(outcome)),
-        ]
     failed = np.flatnonzero(fits.verdicts != "successful")
     if failed.size:
         lines += ["", f"without success: {several(failed.size, 'recording')}"]
@@ -306,27 +290,3 @@ def _data(outcome: StudyFits) -> dict[str, Any]:
             if verdict != "successful"
         ],
     }
-
-
-def _medians(outcome: StudyFits) -> Table:
-    units = outcome.fits.circuit.units()
-    rows = []
-    for group in outcome.fits.summary("subject", "condition"):
-        if not (group["subject"] or group["condition"] or group["successful"]):
-            continue  # recordings that could not be read have no labels
-        row = [group["subject"], group["condition"], f"{group['successful']}/{group['fits']}"]
-        for name, unit in units.items():
-            numbers = (
-                group[key] / DISPLAY[unit][0] for key in (name, f"{name}_spread", f"{name}_stderr")
-            )
-            row.append(_cell(*numbers) if group["successful"] else "")
-        rows.append(tuple(row))
-    heads = tuple(heading(name, unit) for name, unit in units.items())
-    return Table(("subject", "condition", "fits", *heads), tuple(rows))
-
-
-def _cell(value: float, spread: float, error: float) -> str:
-    """Three numbers in one unit, rounded to two significant digits of the standard error."""
-    digits = max(0, 1 - math.floor(math.log10(error))) if 0 < error < math.inf else 3
-    texts = ("-" if math.isnan(one) else f"{one:.{digits}f}" for one in (spread, error))
-    return f"{value:.{digits}f} ({'; '.join(texts)})"

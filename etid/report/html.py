@@ -11,7 +11,6 @@ import hashlib
 import importlib.resources
 import os
 import re
-import textwrap
 from collections.abc import Mapping, Sequence
 
 import jinja2
@@ -41,18 +40,6 @@ class Table:
     searchable: bool = False
     folded: bool = False
     links: Mapping[str, str] = dataclasses.field(default_factory=dict)
-
-    def __str__(self) -> str:
-        lines = [self.columns, *self.rows]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        left = [i == 0 or text for i, text in enumerate(self.texts)]
-        return "\n".join(
-            "  ".join(
-                cell.ljust(width) if to_left else cell.rjust(width)
-                for cell, width, to_left in zip(line, widths, left, strict=True)
-            ).rstrip()
-            for line in lines
-        )
 
     @property
     def texts(self) -> list[bool]:
@@ -107,12 +94,6 @@ class Section:
     warning: str = ""
     details: str = ""
     code: str = ""
-
-    def __str__(self) -> str:
-        paragraphs = filter(None, [self.warning, *_paragraphs(self.text + "\n\n" + self.details)])
-        text = "\n\n".join(textwrap.fill(paragraph, 100) for paragraph in paragraphs)
-        parts = [self.heading, "=" * len(self.heading), text, *map(str, self.tables), self.code]
-        return "\n".join(filter(None, parts))
 
     @property
     def anchor(self) -> str:
