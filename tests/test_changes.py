@@ -248,6 +248,21 @@ def test_skin_that_changes_is_refused_and_said(driver, method):
         np.testing.assert_allclose(fits.table()["r_p_change"][1], fit.change[1], rtol=1e-6)
 
 
+def test_a_choice_of_the_circuit_hides_no_change():
+    """At 40 dB other circuits are fitted too; none is taken in place of the one that changed."""
+    scene = rung("damp", snr_db=40.0)
+    of = etid.identify_driver(scene.simulate(0)[CALIBRATION])
+    recording = recorded(scene, falling(LOADS["damp"], "r_p", 0.2))
+    alone = etid.identify_skin(recording, of, circuit="auto", throw=False)
+    batch = etid.identify_skins([recording, trial(scene, 2)], of, circuit="auto")
+    chosen = etid.select_circuit(recording, of, throw=False)
+    assert len(chosen.fits) > 1
+    for verdict in (alone.verdict, batch.verdicts[0], chosen.fit.verdict):
+        assert verdict == "changed"
+    assert "r_p -" in chosen.residual
+    assert not chosen.late
+
+
 def drifting(recording, name, share):
     """With a gain that rises by a share over the record."""
     rise = 1 + share * recording.time / recording.duration

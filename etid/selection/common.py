@@ -21,7 +21,8 @@ def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) ->
         return 0  # no recording asked for another circuit than the first
     known = [one for one in found if math.isfinite(bic(one.fits)[one.chosen])]
     # Recordings that no circuit explains count only if no circuit explains any.
-    explained = [one for one in known if rank(one.fits[one.chosen]) < 2]
+    chosen = [(one, one.fits[one.chosen]) for one in known]
+    explained = [one for one, fit in chosen if rank(fit) < 2 and fit.verdict != "changed"]
     total = [0.0] * len(candidates)
     for selection in explained or known:
         for number, lost in enumerate(_losses(selection, candidates)):

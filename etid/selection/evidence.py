@@ -12,8 +12,8 @@ noise is large. `python -m benchmarks selection` compares the three.
 Noise that exceeds its estimate divides −2 log L: by −2 log L / n of the best candidate, if that is
 above 1 (quasi-likelihood, Wedderburn 1974).
 
-A circuit must be adequate before it can be better. A candidate with another verdict than
-`successful` is chosen only if no candidate is successful that is simpler or has more evidence.
+A circuit must be adequate before it can be better. A candidate that the data contradict is chosen
+only if no candidate is adequate that is simpler or has more evidence.
 """
 
 import math
@@ -24,6 +24,9 @@ from jaxtyping import Float
 
 from etid.results.fit import Fit, Support
 
+# That a load changed is no fault of the circuit. Only the chosen circuit is tested for it: another
+# one would be chosen in its place, untested.
+_ADEQUATE = ("successful", "changed")
 # The data do not determine all elements, or the driver: they do not contradict the circuit.
 _UNDETERMINED = ("insensitive", "resolution", "driver_unclear", "driver_failed")
 # Difference of BIC that is "not worth more than a bare mention" (Kass and Raftery 1995, section
@@ -37,11 +40,11 @@ def rank(fit: Fit) -> int:
     """How far the data accept a circuit.
 
     Returns:
-        0 for a successful fit; 1 if the data do not determine all its parts, or if a constant-phase
+        0 if they accept it; 1 if the data do not determine all its parts, or if a constant-phase
         element is a capacitor; 2 if the data contradict the circuit.
     """
     name = fit.verdict
-    if name == "successful":
+    if name in _ADEQUATE:
         return int(any(float(alpha) > 1 - NEARLY_ONE for alpha in fit.circuit.exponents()))
     return 1 if name in _UNDETERMINED else 2
 

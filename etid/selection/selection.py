@@ -115,10 +115,10 @@ class Selection(Overviewed):
     def residual(self) -> str:
         """What the residual looks like if no candidate is adequate; otherwise empty."""
         fit = self.candidates[0].fit
-        if rank(fit) == 0:
-            return ""
         if fit.verdict == "changed":
             return fit.changes
+        if rank(fit) == 0:
+            return ""
         if int(fit.remarks) & Remark.mains_hum:
             return "The residual looks like mains hum."
         return "" if fit.support is None else fit.support.looks_like()
