@@ -83,6 +83,10 @@ def test_the_best_circuit_is_adequate_and_a_richer_one_pays_for_its_elements():
         for deviance, chosen in ((896.0, 0), (880.0, 1)):
             fits = {0: made(cole, 900.0, name), 1: made(etid.SkinLayers(), deviance)}
             assert best(fits) == chosen
+    for name in ("changed", "driver_unclear", "insensitive"):  # nor an equally simple one
+        for deviance, chosen in ((880.0, 0), (860.0, 1)):
+            fits = {0: made(skin, 870.0, name), 1: made(etid.SkinWarburg(), deviance)}
+            assert best(fits) == chosen
     for alpha, expected in ((0.995, 1), (0.95, 0)):  # the phase of a capacitor is no reason
         assert rank(made(etid.SkinCole(20e3, 100e3, 30e-6, alpha), 900.0)) == expected
 

@@ -13,7 +13,7 @@ Noise that exceeds its estimate divides −2 log L: by −2 log L / n of the bes
 above 1 (quasi-likelihood, Wedderburn 1974).
 
 A circuit must be adequate before it can be better. A candidate that the data contradict is chosen
-only if no candidate is adequate that is simpler or has more evidence.
+only if no candidate is adequate that has more evidence, or as much with fewer elements.
 """
 
 import math
@@ -24,11 +24,11 @@ from jaxtyping import Float
 
 from etid.results.fit import Fit, Support
 
-# That a load changed is no fault of the circuit. Only the chosen circuit is tested for it: another
-# one would be chosen in its place, untested.
-_ADEQUATE = ("successful", "changed")
-# The data do not determine all elements, or the driver: they do not contradict the circuit.
-_UNDETERMINED = ("insensitive", "resolution", "driver_unclear", "driver_failed")
+# That a load changed, or that Z_th is open, is no fault of the circuit. Another one with less
+# evidence would be chosen in its place: untested, for only the chosen one is tested for changes.
+_ADEQUATE = ("successful", "changed", "driver_unclear")
+# The data do not determine all elements: they do not contradict the circuit.
+_UNDETERMINED = ("insensitive", "resolution", "driver_failed")
 # Difference of BIC that is "not worth more than a bare mention" (Kass and Raftery 1995, section
 # 3.2): of circuits that are so close, the simplest is chosen.
 MENTION = 2.0
@@ -81,8 +81,8 @@ def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) 
 
     It is the simplest of those whose evidence is largest, up to `MENTION`, among the candidates of
     the best rank; of equally simple ones the first, which is the most usual. A candidate with less
-    evidence than a simpler one is not chosen, whatever their ranks: it is no remedy for what the
-    simpler one lacks.
+    evidence than one with no more elements is not chosen, whatever their ranks: it is no remedy for
+    what that one lacks.
     """
     if len(fits) == 1:
         return next(iter(fits))
@@ -93,7 +93,7 @@ def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) 
         number
         for number in fits
         if not any(
-            size[other] < size[number] and criterion[other] < criterion[number] - MENTION
+            size[other] <= size[number] and criterion[other] < criterion[number] - MENTION
             for other in fits
         )
     ]
