@@ -148,6 +148,11 @@ def _step(period: float) -> int:
     return max(1, int(period / 512))
 
 
+def _room(step: int, rise: int) -> int:
+    """Samples beside the coarse place of an edge that hold all of it."""
+    return 8 * step + 4 * rise
+
+
 def _edges_of(above: Bool[np.ndarray, " place"], period: float) -> Int[np.ndarray, " pulse"]:
     """Starts of the pulses, or their ends if there are more ends; none without a whole pulse."""
     turns = np.flatnonzero(np.diff(above)) + 1
@@ -173,7 +178,7 @@ def _spacings(
     off = 2 * step + 2  # [samples] error of the coarse edges
     rise = rise_time(sample_rate)
     room = min(first, size - last - rise)
-    width = min(8 * step + 4 * rise, (last - first) // 4)
+    width = min(_room(step, rise), (last - first) // 4)
     before = max(0, min(width, room - off))
     after = max(1, min(width, size - last - off - rise))
     template = rises(records[rows, first - before : first + after + rise], rise)
@@ -254,7 +259,7 @@ def clocks_apart(
     for (_, late), rows in alike.items():
         train = trains[rows[0]]
         rise, step = rise_time(train.sample_rate), _step(train.sample_rate / train.pulse_rate)
-        width, off = 8 * step + 4 * rise, 2 * step + 2
+        width, off = _room(step, rise), 2 * step + 2
         room = train.edges + np.array([[min(late, 0)], [max(late, 0)]])
         least = step + 1 + off  # an edge is within a step before its coarse place
         fits = (room[0] >= least) & (room[1] + width + off + rise <= records.shape[2])
@@ -384,7 +389,7 @@ def _window(v_th: Float[np.ndarray, " time"], train: PulseTrain) -> _Window:
     coarse = v_th[begin : begin + number * step].reshape(number, step).mean(1)
     coarse = np.abs(coarse - coarse.mean())
     high = begin + step * np.flatnonzero(~(coarse < 0.5 * coarse.max()))
-    beside = 8 * step + 4 * rise
+    beside = _room(step, rise)
     first, last = max(0, high[0] - beside), min(high[-1] + step + beside, v_th.size)
     return _Window(int(first), int(last), around, rise, min(400, int(period / 4)))
 
