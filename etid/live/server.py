@@ -140,7 +140,7 @@ async def _serve(listening: socket.socket, slot: Slot, told: dict[str, Any]) -> 
     application = Application(
         [(path, handler, given) for path, handler in paths.items()], log_function=lambda _: None
     )
-    server = HTTPServer(application, max_body_size=100)
+    server = HTTPServer(application, max_body_size=1000)
     listening.setblocking(False)
     server.add_socket(listening)
     loop = multiprocessing.parent_process()
