@@ -54,7 +54,7 @@ def effort(cell: Cell, quick: bool, drivers: int) -> dict[str, Effort]:
     usual = dict.fromkeys(OURS, Effort(1 if quick else drivers, ALL))
     if quick:
         return {**usual, "output_error": Effort(1, 2)}
-    usual |= {"non_parametric": Effort(drivers, 3), "output_error": Effort(1, 3)}
+    usual["output_error"] = Effort(1, 3)
     cost = max(1.0, cell.scene.sample_rate / 200e3, cell.scene.samples / USUAL / 3)
     return {name: Effort(max(1, round(of.drivers / cost)), of.trials) for name, of in usual.items()}
 

@@ -16,7 +16,6 @@ from etid.estimators import registry
 LETTERS = {
     "default": "etid",
     "maximum_likelihood": "max. likelihood",
-    "non_parametric": "non-parametric",
     "output_error": "output error",
     "steiglitz_mcbride": "Steiglitz-McBride",
     "equation_error": "equation error",

@@ -69,7 +69,6 @@ METHODS = {
     "maximum_likelihood": ("maximum_likelihood", 550),
     "steiglitz_mcbride": ("steiglitz_mcbride", 100),
     "equation_error": ("steiglitz_mcbride", 300),
-    "non_parametric": ("maximum_likelihood", 40),
     "output_error": ("output_error", 10),
 }
 

@@ -225,10 +225,7 @@ def test_hum_wander_and_a_record_that_begins_within_a_pulse_are_no_change_of_the
 
 @pytest.mark.parametrize(
     "method",
-    [
-        "maximum_likelihood",
-        *(pytest.param(of, marks=pytest.mark.slow) for of in ("non_parametric", "output_error")),
-    ],
+    ["maximum_likelihood", pytest.param("output_error", marks=pytest.mark.slow)],
 )
 def test_skin_that_changes_is_refused_and_said(driver, method):
     """R_p falls by 5 %: its fit would be 25 of its standard errors from either end."""

@@ -41,7 +41,6 @@ def limits(draws):
     [
         ("maximum_likelihood", 60.0, 10_000, False, 40),
         ("maximum_likelihood", 60.0, 10_000, True, 40),
-        ("non_parametric", 60.0, 10_000, True, 40),
         ("joint", 60.0, 10_000, True, 20),
         ("output_error", 40.0, 3334, False, 16),
     ],

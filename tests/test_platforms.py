@@ -11,7 +11,6 @@ from etid.simulation import scenes
 # The estimators of batches, and those that identify their drivers.
 DRIVERS = {
     "maximum_likelihood": "maximum_likelihood",
-    "non_parametric": "maximum_likelihood",
     "output_error": "output_error",
     "steiglitz_mcbride": "steiglitz_mcbride",
     "equation_error": "steiglitz_mcbride",

@@ -44,9 +44,8 @@ etid.identify_skin(of.skin, of.driver, circuit=etid.Resistor(), method='equation
     -> identifies SkinRC only
 etid.predict(of.skin, of.driver) -> give the circuit
 skin(of, method='steiglitz_mcbride') -> steiglitz_mcbride.*from a measured current
-etid.identify_skin(of.skin, of.driver, circuit='auto', method='non_parametric')
+etid.identify_skin(of.skin, of.discrete, circuit='auto', method='steiglitz_mcbride')
     -> computes no likelihood
-skin(of, method='non_parametric') -> non_parametric.*from a measured current
 etid.identify_skin(of.skin, of.driver, method=WITH_CURRENT) -> needs a driver and a current
 etid.identify_skin(of.both, method=WITH_CURRENT) -> needs a driver and a current
 samples(of, method=WITH_CURRENT) -> arrays have no current
@@ -63,8 +62,8 @@ skin(of, bounds={'r_s': (-1.0, 1000.0)}) -> must not be negative
 skin(of, bounds={'r_s': (np.nan, 1000.0)}) -> bounds of r_s are nan
 skin(of, bounds={'r_x': (1.0, 1000.0)}, circuit='auto') -> 'r_x' is no element of SkinRC
 skin(of, bounds={'r_s': (1.0, 1000.0)}, fixed={'r_s': 5.0}) -> r_s is fixed and has bounds
-skin(of, bounds={'r_s': (1.0, 1000.0)}, method='non_parametric')
-    -> 'non_parametric' takes no known elements and no bounds
+skin(of, bounds={'r_s': (1.0, 1000.0)}, method='steiglitz_mcbride')
+    -> 'steiglitz_mcbride' takes no known elements and no bounds
 of.impedance.posterior() -> a measured impedance has no draws and no profiles
 of.impedance.plot(show='residual') -> no residual in time
 etid.Instrument(gain=-1e-3) -> gain

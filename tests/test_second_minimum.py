@@ -96,11 +96,3 @@ def test_a_second_resistor_or_a_stated_delay_leaves_no_other_minimum(seed):
     )
     for driver in drivers:
         assert np.abs(off(etid.identify_skin(of["damp"], driver), DAMP)).max() < SIGMAS
-
-
-def test_other_methods_are_not_searched_twice():
-    """What they know of a driver has no delay from which to search; an error would be seen here."""
-    of = study(0)
-    driver = etid.identify_driver(of["known/98800"], order=5)
-    fit = etid.identify_skin(of["damp"], driver, method="non_parametric", throw=False)
-    assert np.isfinite(fit.chi2)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.signal
 
 from etid import SkinRC
@@ -40,7 +41,7 @@ def impulse_fit(h, orders, iterations):
 
     def assess(candidate):
         simulated = lfilter(candidate.num, candidate.den, impulse)[0]
-        return jnp.linalg.norm(simulated - h) / jnp.linalg.norm(h), jnp.array(True)
+        return jnp.linalg.norm(simulated - h) / jnp.linalg.norm(h)
 
     zeros, poles = orders
 
@@ -101,7 +102,6 @@ def test_driver_and_skin_are_exact_on_discrete_data(exact):
     elements = skin_elements(skin.filter, FS)
     np.testing.assert_allclose(elements.values(), DAMP.values(), rtol=1e-7)
     assert bool(skin.converged)
-    assert bool(skin.closed_loop_stable)
     # The same in the periodic steady state, with two resistors and harmonics that are left out.
     r = jnp.array([98.8e3, 21.62e3])
     frequency = jnp.broadcast_to(60.0 * jnp.arange(1.0, 1601), (2, 1600))
@@ -136,14 +136,20 @@ def test_elements_satisfy_equations_10_to_12(circuit):
 
 
 def test_the_magnitude_as_printed_costs_what_it_costs():
+    """C_p where |Z(j/(R_p C_p))| is (2 R_s + R_p)/√2, as the paper prints it."""
     excess = []
     for circuit in (DRY, DAMP):
-        printed = skin_elements(tustin(circuit), FS, as_printed=True)
-        excess.append(float(printed.c_p / circuit.c_p) - 1)
-        omega = 1 / float(printed.r_p * printed.c_p)
-        z = complex(circuit.impedance()(jnp.asarray(1j * omega)))
-        expected = (2 * float(circuit.r_s) + float(circuit.r_p)) / np.sqrt(2)
-        np.testing.assert_allclose(abs(z), expected, rtol=1e-9)
+        r_s, r_p, c_p = (float(x) for x in circuit.values())
+        printed = (2 * r_s + r_p) / np.sqrt(2)
+
+        z, corner = circuit.impedance(), 1 / (r_p * c_p)
+        omega = scipy.optimize.brentq(
+            lambda omega, z, printed: abs(complex(z(jnp.asarray(1j * omega)))) - printed,
+            0.1 * corner,
+            corner,
+            args=(z, printed),
+        )
+        excess.append(1 / (r_p * omega) / c_p - 1)
     np.testing.assert_allclose(excess, [0.38, 0.88], atol=0.01)
 
 

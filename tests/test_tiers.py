@@ -320,7 +320,7 @@ def test_a_long_compilation_is_announced_once_on_a_terminal_and_not_in_a_file(
 
 
 CIRCUITS = etid.SkinLayers(), etid.ParallelRC(), etid.SkinCole(), etid.Resistor()
-METHODS = "steiglitz_mcbride", "equation_error", "output_error", "non_parametric"
+METHODS = "steiglitz_mcbride", "equation_error", "output_error"
 OPTIONS = (
     {},
     *({"circuit": circuit} for circuit in CIRCUITS),
@@ -336,7 +336,7 @@ def test_drawn_recordings_by_all_methods_and_circuits_are_those_of_xla(options, 
     """Dry and damp skin, 20 to 80 dB, with and without delays; several recordings of a driver."""
     rng = np.random.default_rng(OPTIONS.index(options))
     method = options.get("method")
-    in_time = method in METHODS[:3]
+    in_time = method in METHODS
     for scene in (etid.scenes.paper_dry, etid.scenes.paper_damp):
         study = scene(
             # Standard errors of output error at 28 dB move by 12 % between the instructions of two

@@ -104,17 +104,13 @@ def test_the_limit_is_exceeded_as_rarely_as_a_study_can_bear():
     np.testing.assert_allclose(scipy.stats.chi2.sf(SEEN, directions), FALSE_ALARMS, rtol=1e-2)
 
 
-@pytest.mark.parametrize(
-    "method",
-    ["maximum_likelihood", pytest.param("non_parametric", marks=pytest.mark.slow)],
-)
-def test_a_skin_behind_a_changed_driver_is_inconsistent(driver, method):
+def test_a_skin_behind_a_changed_driver_is_inconsistent(driver):
     """R_p was 63 of its standard errors off, at chi2 1."""
-    fit = etid.identify_skin(study(seed=1)["loaded/0"], driver, method=method)
+    fit = etid.identify_skin(study(seed=1)["loaded/0"], driver)
     assert fit.verdict == "successful"
     later = study(changed(r_protection=1.05), seed=1)["loaded/0"]
     with pytest.raises(etid.IdentificationError, match="inconsistent"):
-        etid.identify_skin(later, driver, method=method)
+        etid.identify_skin(later, driver)
 
 
 @pytest.mark.slow

@@ -308,7 +308,7 @@ def inductor(inductance: Henry) -> Inductance:
     """An inductor, Z = s L, from L [H].
 
     In series it makes the impedance grow with the frequency. Such a load has no response in time;
-    maximum likelihood, `"non_parametric"` and `identify_impedance` need none.
+    maximum likelihood and `identify_impedance` need none.
     """
     return Inductance(inductance)
 

@@ -176,8 +176,8 @@ class AbstractIrrational(AbstractElement):
     def rational(self) -> Rational:
         """Raise ValueError: the impedance is not a ratio of polynomials."""
         raise ValueError(
-            f"{type(self).__name__} is no rational function of s; use a method that evaluates Z(s) "
-            "at harmonics (method='maximum_likelihood' or 'non_parametric')"
+            f"{type(self).__name__} is no rational function of s; use "
+            "method='maximum_likelihood', which evaluates Z(s) at harmonics"
         )
 
     def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:

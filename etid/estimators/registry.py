@@ -4,7 +4,6 @@ import dataclasses
 
 from etid.estimators.estimator import AbstractEstimator, Description
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
-from etid.estimators.non_parametric.estimator import NonParametric
 from etid.estimators.output_error.estimator import OutputError
 from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
 from etid.results.method_options import options_of
@@ -30,7 +29,6 @@ def register(estimator: AbstractEstimator) -> None:
 
 for _estimator in (
     MAXIMUM_LIKELIHOOD,
-    NonParametric(),
     OUTPUT_ERROR,
     SteiglitzMcBride(),
     EquationError(),

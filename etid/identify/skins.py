@@ -96,8 +96,7 @@ def identify_skin(
         circuit: Structure of the load and its typical values, or a circuit string such as
             `"R0-p(R1,C1)"`; `SkinRC` if not given. With `"auto"` it is the simplest circuit that
             the recording supports; `select_circuit` shows the choice.
-        method: A method of `identify_driver`, or `"non_parametric"`, which uses the drivers of
-            maximum likelihood, or any registered name.
+        method: A method of `identify_driver`, or any registered name.
         fixed: Known values of elements by name [SI], as in `{"r_s": 500.0}`. Their standard errors
             are 0.
         prior: Values of elements with their standard deviations, as in `{"r_s": (500.0, 50.0)}`;

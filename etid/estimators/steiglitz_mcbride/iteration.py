@@ -56,7 +56,6 @@ class Iterate(eqx.Module):
         iteration: Number of its iteration; 0 is equation error.
         converged: Whether the *last* iterations converged.
         stable: Whether N/D itself is stable.
-        closed_loop_stable: Whether the driver loaded with this circuit is stable.
     """
 
     filter: Rational
@@ -64,7 +63,6 @@ class Iterate(eqx.Module):
     iteration: Int[Array, ""]
     converged: Bool[Array, ""]
     stable: Bool[Array, ""]
-    closed_loop_stable: Bool[Array, ""]
 
 
 def _delayed(v: Float[Array, "record time"], lags: range) -> Float[Array, "record time lag"]:
@@ -103,7 +101,7 @@ def iterate(
     solve: Callable[[Float[Array, " a"]], Rational],
     zeros: int,
     poles: int,
-    assess: Callable[[Rational], tuple[Float[Array, ""], Bool[Array, ""]]],
+    assess: Callable[[Rational], Float[Array, ""]],
     iterations: int = ITERATIONS,
 ) -> Iterate:
     """Fit N/D with X N/D = W over one or several records (eqs. 1, 2).
@@ -112,18 +110,18 @@ def iterate(
         solve: Function that returns N_i/D_i, given D_{i−1}.
         zeros: Order of N.
         poles: Order of D.
-        assess: Function that returns the RRSE of the voltage that a candidate predicts, and
-            whether its closed loop is stable.
+        assess: Function that returns the RRSE of the voltage that a candidate predicts; infinite
+            if its closed loop is unstable.
         iterations: Number of iterations; 1 is equation error.
     """
 
     def step(carry: _Carry, iteration: Int[Array, ""]) -> tuple[_Carry, Float[Array, ""]]:
         best, previous = carry
         candidate = solve(previous)
-        error, closed_loop_stable = assess(candidate)
+        error = assess(candidate)
         change = jnp.linalg.norm(candidate.den - previous) / jnp.linalg.norm(candidate.den)
         stable = is_stable(candidate.den)
-        current = Iterate(candidate, error, iteration, change < SETTLED, stable, closed_loop_stable)
+        current = Iterate(candidate, error, iteration, change < SETTLED, stable)
         # While no iterate can be simulated, keep the latest.
         better = (error < best.rrse) | ~jnp.isfinite(best.rrse)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), current, best)
@@ -134,7 +132,6 @@ def iterate(
         Rational(jnp.zeros(zeros + 1), jnp.zeros(poles + 1).at[0].set(1.0)),
         jnp.array(jnp.inf),
         jnp.array(0),
-        jnp.array(False),
         jnp.array(False),
         jnp.array(False),
     )
@@ -174,6 +171,11 @@ def terminal_voltage(
     return lfilter(forward, safe, v_th)[0], stable
 
 
+def _finite(error: Float[Array, ""], stable: Bool[Array, ""]) -> Float[Array, ""]:
+    """The error; infinite if it is not finite or the loop is unstable."""
+    return jnp.where(stable & jnp.isfinite(error), error, jnp.inf)
+
+
 def driver_filter(
     v_th: Float[Array, "record time"],
     v_out: Float[Array, "record time"],
@@ -186,17 +188,15 @@ def driver_filter(
     Z_th = (α₀ + … + α₄ z⁻⁴) / (1 + β₁ z⁻¹ + … + β₅ z⁻⁵)                (4)
     """
 
-    def assess(candidate: Rational) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    def assess(candidate: Rational) -> Float[Array, ""]:
         def one(
             v_th: Float[Array, " time"], v_out: Float[Array, " time"], r: Float[Array, ""]
-        ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+        ) -> Float[Array, ""]:
             load = Rational(r[None], jnp.ones(1, r.dtype))
             predicted, stable = terminal_voltage(candidate, load, v_th)
-            return jnp.where(stable, rrse(predicted, v_out), jnp.inf), stable
+            return _finite(rrse(predicted, v_out), stable)
 
-        errors, stable = jax.vmap(one)(v_th, v_out, r_load)
-        error = errors.max()
-        return jnp.where(jnp.isfinite(error), error, jnp.inf), stable.all()
+        return jax.vmap(one)(v_th, v_out, r_load).max()
 
     w = r_load[:, None] * (v_th - v_out)
     return iterate(in_time(v_out, w, order - 1, order), order - 1, order, assess, iterations)
@@ -226,14 +226,13 @@ def periodic_driver_filter(
         weighted = parts / jnp.sqrt(power(den))[None, None, :]
         return least_squares(weighted.reshape(parts.shape[0], -1).T, order)
 
-    def assess(candidate: Rational) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    def assess(candidate: Rational) -> Float[Array, ""]:
         num = jnp.tensordot(as_complex(candidate.num), delays[:-1], 1)
         forward = r * jnp.tensordot(as_complex(candidate.den), delays, 1)
         predicted = forward * reciprocal(forward + num) * x
         closed = [add_polynomials(of * candidate.den, candidate.num) for of in r_load]
         stable = jnp.stack([is_stable(one) for one in closed]).all()
-        error = jax.vmap(complex_rrse)(predicted, y).max()
-        return jnp.where(stable & jnp.isfinite(error), error, jnp.inf), stable
+        return _finite(jax.vmap(complex_rrse)(predicted, y).max(), stable)
 
     return iterate(solve, order - 1, order, assess)
 
@@ -246,18 +245,15 @@ def skin_filter(
 ) -> Iterate:
     """Identify the discrete first-order Z_bio (paper, eqs. 7-9)."""
 
-    def assess(candidate: Rational) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    def assess(candidate: Rational) -> Float[Array, ""]:
         predicted, stable = terminal_voltage(z_th, candidate, v_th)
-        error = jnp.where(stable, rrse(predicted, v_out), jnp.inf)
-        return jnp.where(jnp.isfinite(error), error, jnp.inf), stable
+        return _finite(rrse(predicted, v_out), stable)
 
     w = lfilter(z_th.num, z_th.den, v_out)[0]
     return iterate(in_time((v_th - v_out)[None], w[None], 1, 1), 1, 1, assess, iterations)
 
 
-def skin_elements(
-    z_bio: Rational, sample_rate: float | Float[Array, ""], *, as_printed: bool = False
-) -> SkinRC:
+def skin_elements(z_bio: Rational, sample_rate: float | Float[Array, ""]) -> SkinRC:
     """Elements of the first-order discrete Z_bio under the bilinear map (paper, eqs. 10-12).
 
     R_s = Z(∞),   R_p = Z(0) − R_s,   C_p from |Z(j/(R_p C_p))| = √((R_s+R_p)² + R_s²) / √2
@@ -269,18 +265,10 @@ def skin_elements(
     Args:
         z_bio: Discrete impedance, a rational function of z⁻¹.
         sample_rate: Sampling rate [Hz].
-        as_printed: Use the magnitude as printed in the paper.
     """
     n, d = z_bio.num, z_bio.den
     r_s = (n[0] - n[1]) / (d[0] - d[1])  # s = ∞ is z = −1, eq. (10)
     total = (n[0] + n[1]) / (d[0] + d[1])  # s = 0 is z = 1, eq. (11)
     r_p = total - r_s
     tau = (d[0] - d[1]) / (d[0] + d[1]) / (2 * sample_rate)  # the pole, s = −1/(R_p C_p), eq. (12)
-    c_p = tau / r_p
-    if as_printed:
-        magnitude = (2 * r_s + r_p) / jnp.sqrt(2.0)
-        # |Z(jω)|² = (total² + r_s² x²) / (1 + x²) with x = ω R_p C_p; the paper takes 1/ω for R_p
-        # C_p.
-        x = jnp.sqrt((total**2 - magnitude**2) / (magnitude**2 - r_s**2))
-        c_p = c_p / x
-    return SkinRC(r_s, r_p, c_p)
+    return SkinRC(r_s, r_p, tau / r_p)

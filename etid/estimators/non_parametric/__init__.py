@@ -1,1 +1,0 @@
-"""Maximum likelihood without a model of Z_th: fit and estimator."""
