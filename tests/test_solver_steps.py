@@ -45,10 +45,10 @@ def test_a_step_is_bent_where_the_second_order_is_small_beside_it(part, accepted
     """2 |a| ≤ ¾ |v|; the step is v + ½ a then."""
     y = TARGET + jnp.array([30.0, 40.0])
 
-    def second_order(residual, y, step, args):
+    def bend(y, step, args):
         return part * (y - TARGET)
 
-    solver = LevenbergMarquardt(damping=DAMPING, geodesic=True, second_order=second_order)
+    solver = LevenbergMarquardt(damping=DAMPING, bend=bend)
     [(_, state)] = after(solver, y, [])
     plain = -(y - TARGET) / (1 + DAMPING)
     np.testing.assert_allclose(state.y_eval - y, plain * (1 + 0.5 * part * accepted), rtol=1e-12)

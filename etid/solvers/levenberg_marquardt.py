@@ -37,7 +37,6 @@ RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cann
 ROUNDING = 4.0  # rounding error of the model [ε]
 IDLE_STEPS = 3  # accepted steps in a row without progress, while the steps grow fivefold
 ACCELERATION = 0.75  # largest second-order part relative to the step (Transtrum and Sethna)
-DIFFERENCE = 0.1  # of the step: spacing of the second difference (Transtrum and Sethna)
 STALLED_STEP = 1e-15  # a relative step that no longer changes the parameters in double precision
 
 
@@ -112,23 +111,6 @@ def best_start(
     return starts[jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))]
 
 
-def second_order(
-    residual: Callable[[Float[Array, " parameter"], Any], Float[Array, " sample"]],
-    y: Float[Array, " parameter"],
-    step: Float[Array, " parameter"],
-    args: Any = None,
-) -> Float[Array, " parameter"]:
-    """Jᵀ r″, where r″ is the second derivative of the residual along the step."""
-
-    def value(y: Float[Array, " parameter"]) -> Float[Array, " sample"]:
-        return residual(y, args)
-
-    # Differences are accurate enough for a step. Nested derivatives compile twice as long.
-    ends = jax.vmap(value)(y[None, :] + DIFFERENCE * jnp.array([[1.0], [-1.0]]) * step[None, :])
-    middle, pullback = jax.vjp(value, y)
-    return pullback((ends.sum(0) - 2 * middle) / DIFFERENCE**2)[0]
-
-
 Residual = Callable[[Array, Any], tuple[Array, Any]]
 """A residual function of optimistix: (y, args) to the residual and an auxiliary output."""
 
@@ -172,12 +154,11 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             for example of a superfluous pole, never meets the two criteria above.
         damping: Damping of the first step, relative to the unit diagonal of the scaled matrix.
         norm: Norm of the scaled step and parameters.
-        geodesic: Bend each step along the curvature of the model, by its second derivative
-            (Transtrum and Sethna 2012, arXiv:1201.5885). In curved valleys this takes a fraction of
-            the steps. Each step costs a third more.
         search: Accepts or rejects the step and sets the damping.
         equations: Evaluates the normal equations of `fn(y, args)`.
-        second_order: Evaluates Jᵀ r″ of `fn(y, args)`.
+        bend: Jᵀ r″ of `fn(y, args)` at y, from (y, step, args), where r″ is the second derivative
+            along the step. With it, steps follow the curvature of the model (Transtrum and Sethna
+            2012, arXiv:1201.5885), which takes fewer of them in curved valleys.
     """
 
     rtol: float | Float[Array, ""] = 1e-6  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -191,9 +172,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
         high_cutoff=0.75, high_constant=5.0, low_constant=0.25
     )
-    geodesic: bool = False
     equations: Callable[[Any, Array, Any], NormalEquations] = normal_equations
-    second_order: Callable[[Callable, Array, Array, Any], Array] = second_order
+    bend: Callable[[Array, Array, Any], Array] | None = None
 
     def init(
         self,
@@ -284,16 +264,16 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         result = optx.RESULTS.where(
             failed, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         )
-        if self.geodesic:
+        if (bend := self.bend) is not None:
 
-            def bend() -> Array:
-                bent = self.second_order(_value(fn), y, proposed / safe, args) / safe
+            def bent_step() -> Array:
+                bent = bend(y, proposed / safe, args) / safe
                 bent = eqx.tree_at(lambda e: e.gradient, scaled, bent)
                 turned = bent.step(damping)
                 small = 2 * self.norm(turned) <= ACCELERATION * self.norm(proposed)
                 return proposed + jnp.where(small, 0.5 * turned, 0.0)
 
-            proposed = jax.lax.cond(terminate, lambda: proposed, bend)
+            proposed = jax.lax.cond(terminate, lambda: proposed, bent_step)
         state = State(
             first_step=jnp.array(False),
             y_eval=y + proposed / safe,

@@ -34,10 +34,11 @@ from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers import successive
 from etid.solvers.least_squares import stepped
-from etid.solvers.levenberg_marquardt import DIFFERENCE, LevenbergMarquardt, NormalEquations
+from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse_root
 
 WITHIN = 0.01  # [standard errors] from the minimum of an approximation
+DIFFERENCE = 0.1  # of the step: spacing of the second difference (Transtrum and Sethna)
 W = 2  # number of signals of W: real and imaginary part
 
 
@@ -175,9 +176,9 @@ def _equations(
 
 
 def _second_order(
-    _, common: Float[Array, " common"], step: Float[Array, " common"], study: tuple[_Signals, _Near]
+    common: Float[Array, " common"], step: Float[Array, " common"], study: tuple[_Signals, _Near]
 ) -> Float[Array, " common"]:
-    """Jᵀ r″ as in `levenberg_marquardt.second_order`; the priors are taken as linear."""
+    """Jᵀ r″, r″ the second derivative along the step; the priors are taken as linear."""
     signals, near = study
     ends = [signals(common + h * step) for h in (DIFFERENCE, 0.0, -DIFFERENCE)]
     found = jnp.zeros_like(common)
@@ -303,9 +304,8 @@ def minimum(
     solver = LevenbergMarquardt(
         rtol=WITHIN / math.sqrt(terms),
         ftol=SOLVER.ftol / (1 + count),
-        geodesic=True,
         equations=_equations,
-        second_order=_second_order,
+        bend=_second_order,
     )
 
     start, named = ravel_pytree((common, owns))
