@@ -83,26 +83,42 @@ def test_several_bounded_elements_are_those_of_draws_inside_the_box():
     assert bool(far.contradicted)
 
 
-@pytest.mark.parametrize("from_bound", [0.0, 1.0, 4.0])
-def test_intervals_contain_the_truth_as_often_as_they_say_near_and_far_from_a_bound(from_bound):
-    """Between 94.2 and 97.3 % by quadrature; three standard deviations of 10 000 draws are 0.7."""
-    truth, error = np.array([30e3, 180e3, 0.1e-9]), np.array([3e3, 3e3, 3e-12])
-    related = np.array([[1, -0.8, 0.5], [-0.8, 1, -0.4], [0.5, -0.4, 1]])
-    cov = jnp.asarray(related * np.outer(error, error))
-    bounds = (("r_s", float(truth[0] - from_bound * error[0]), 60e3),)
-    drawn = np.random.default_rng(1).multivariate_normal(truth, cov, 10_000)
+TRUTH, ERROR = np.array([30e3, 180e3, 0.1e-9]), np.array([3e3, 3e3, 3e-12])
+RELATED = np.array([[1, -0.8, 0.5], [-0.8, 1, -0.4], [0.5, -0.4, 1]])
+
+
+def coverage(bounds, draws=10_000):
+    """Part of the intervals of 95 % that contain the truth, for each element."""
+    cov = jnp.asarray(RELATED * np.outer(ERROR, ERROR))
+    drawn = np.random.default_rng(1).multivariate_normal(TRUTH, cov, draws)
 
     def one(values):
         found = within(etid.SkinRC(*values), cov, cov, bounds)
         return found.values, jnp.sqrt(jnp.diagonal(found.cov))
 
     values, errors = jax.jit(jax.vmap(one))(jnp.asarray(drawn))
-    covered = np.mean(np.abs(np.asarray(values) - truth) < 1.96 * np.asarray(errors), axis=0)
+    return np.mean(np.abs(np.asarray(values) - TRUTH) < 1.96 * np.asarray(errors), axis=0)
+
+
+@pytest.mark.parametrize("from_bound", [0.0, 1.0, 4.0])
+def test_intervals_contain_the_truth_as_often_as_they_say_near_and_far_from_a_bound(from_bound):
+    """Between 94.2 and 97.3 % by quadrature; three standard deviations of 10 000 draws are 0.7."""
+    covered = coverage((("r_s", float(TRUTH[0] - from_bound * ERROR[0]), 60e3),))
     assert 0.935 < covered[0] < 0.98
     # An element that is related to it is covered worst if the truth is the bound itself: 90 %.
     assert ((covered > 0.89 if from_bound == 0 else covered > 0.93) & (covered < 0.98)).all(), (
         covered
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("from_bounds", "expected"), [(0.0, 0.729), (0.5, 0.913), (1.0, 0.955)])
+def test_intervals_of_three_bounded_elements_hold_what_the_guide_says(from_bounds, expected):
+    """The worst element in the worst corner of a box whose sides are six errors long."""
+    low = TRUTH - ERROR * np.array([from_bounds, 6.0 - from_bounds, from_bounds])
+    bounds = zip(("r_s", "r_p", "c_p"), low, low + 6.0 * ERROR, strict=True)
+    covered = coverage(tuple((name, float(a), float(b)) for name, a, b in bounds), draws=2000)
+    assert abs(covered.min() - expected) < 3 * np.sqrt(expected * (1 - expected) / 2000)
 
 
 def test_bounds_far_away_change_nothing_and_those_that_contradict_the_data_are_no_success():
