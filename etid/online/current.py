@@ -60,8 +60,7 @@ class CurrentModel(eqx.Module):
         source_error: Errors of log Z_th by the calibrations, as in `GainModel`.
         faults: Errors of the instrument, as in `GainModel`.
         sums: Weights w of the admittance in Re Σ w Y: row 0 for the charge [C Ω], the others for
-            the current at `times` [A Ω].
-        times: Times of the other rows after the start of the window [s].
+            the current at times that are dense at the edges [A Ω].
         phase: Duration of a phase, t₁ − t₀ [s].
         rest: Upper bound of the charge of a pulse after a pause, relative to `Current.charge`.
     """
@@ -71,7 +70,6 @@ class CurrentModel(eqx.Module):
     source_error: Complex[Array, "z band"]
     faults: Float[Array, "z 3"] | None
     sums: Complex[Array, "row band"]
-    times: Float[Array, " time"]
     phase: float = eqx.field(static=True)
     rest: float = eqx.field(static=True)
 
@@ -98,18 +96,12 @@ class CurrentModel(eqx.Module):
             source_error=pulses.source_error,
             faults=pulses.faults,
             sums=jnp.asarray(by_band),
-            times=jnp.asarray(times / rate),
             phase=float((end - begin) / rate),
             rest=float(bands.samples / (bands.samples - (end - begin))),
         )
 
-    def waveform(self, circuit: AbstractCircuit) -> Float[Array, " time"]:
-        """Current through a load at `times`, per unit of relative amplitude [A]."""
-        admittance = reciprocal(circuit.response(self.frequency) + self.source)
-        return _real(self.sums[1:], admittance)
-
     def short_circuit(self) -> Float[Array, " time"]:
-        """Current through a short circuit at `times`, per unit of relative amplitude [A]."""
+        """Current through a short circuit at these times, per unit of relative amplitude [A]."""
         return _real(self.sums[1:], reciprocal(self.source))
 
     def short_charge(self, quantile: Float[Array, ""]) -> Float[Array, ""]:
