@@ -36,11 +36,6 @@ class RecordingError(ValueError):
         text = f"{place}: {self.message}" if place else self.message
         return f"{text}. {self.remedy}." if self.remedy else f"{text}."
 
-    def __reduce__(self) -> tuple:
-        # Workers send these errors between processes. By default an exception pickles only its
-        # positional arguments.
-        return (_rebuild_error, (self.message, self.file, self.path, self.field, self.remedy))
-
     def located(self, *, file: str = "", path: str = "", field: str = "") -> "RecordingError":
         """The same error; parts of its place that are empty are filled in."""
         return RecordingError(
@@ -61,10 +56,6 @@ def require_file(path: str) -> None:
 def not_recorded(path: str, field: str, remedy: str) -> RecordingError:
     """The error for a record that the recording at a path does not have."""
     return RecordingError("was not recorded", path=path, field=field, remedy=remedy)
-
-
-def _rebuild_error(message: str, file: str, path: str, field: str, remedy: str) -> RecordingError:
-    return RecordingError(message, file=file, path=path, field=field, remedy=remedy)
 
 
 @contextlib.contextmanager
