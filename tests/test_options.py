@@ -1,16 +1,14 @@
 """Options of a fit: the same at every public function, checked at the call, kept in files."""
 
-import dataclasses
 from typing import Any
 
-import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
 from etid import cli
-from etid.results.study_fits import PLAUSIBLE, StudyFits
+from etid.results.study_fits import StudyFits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -113,15 +111,7 @@ def test_a_tolerance_that_no_fit_would_contain_is_refused(source, tmp_path, caps
     assert not target.exists()
 
 
-def test_files_of_fits_store_the_options_and_older_files_are_read(fitted, tmp_path):
+def test_files_of_fits_store_the_options(fitted):
     settings = stored(fitted)
     assert settings.plausible == (0.0, np.inf)
     assert (settings.fixed, settings.bounds) == (("r_0 33.4",), ("r_1 above 100.0",))
-    older = tmp_path / "older.h5"
-    older.write_bytes(fitted.read_bytes())
-    with h5py.File(older, "r+") as content:
-        del content.attrs["plausible"]
-        content.attrs["r_load_tolerance"] = 0.01
-    assert stored(older) == dataclasses.replace(
-        settings, plausible=PLAUSIBLE, instrument=("r_load 0.01",)
-    )

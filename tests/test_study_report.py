@@ -171,7 +171,7 @@ def test_recordings_are_looked_for_where_they_were_and_beside_the_fits(found, st
 
 
 def test_fits_without_settings_are_reported_with_what_they_lack(found, tmp_path):
-    found.fits.write(tmp_path / "fits.h5")  # what an older version wrote
+    found.fits.write(tmp_path / "fits.h5")
     assert StudyFits.read(tmp_path / "fits.h5").settings is None
     etid.write_report(tmp_path / "fits.h5", tmp_path / "page.html")
     text = _Read(tmp_path / "page.html").text

@@ -95,10 +95,7 @@ def _elements(table: Table) -> list[str]:
 def _columns(table: Table, names: Sequence[str]) -> dict[str, h5py.Dataset]:
     """The columns of `Fits.table()` as HDF5 datasets that are not read yet."""
     elements = [name + ending for name in names for ending in ("", "_stderr")]
-    changes = (f"{name}_change" for name in (*names, "amplitude"))
-    elements += [
-        name for name in changes if name in table
-    ]  # files before schema version 1.2 lack them
+    elements += [f"{name}_change" for name in (*names, "amplitude")]
     quality = {"rrse": "number", "chi2": "number", "steps": "integer", "verdict": "text",
                "remarks": "text", "note": "text"}  # fmt: skip
     kinds = DESCRIBED | dict.fromkeys(elements, "number") | quality

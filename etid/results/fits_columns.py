@@ -69,24 +69,20 @@ def columns_of(
     """
     kind = _circuit(table, circuit)
     size = len(kind.names())
-    kinds = DESCRIBED | {"verdict": "text", "note": "text"}
+    kinds = DESCRIBED | {"verdict": "text", "remarks": "text", "note": "text"}
     columns = {name: table.column(name, kind) for name, kind in kinds.items()}
-    columns |= {name: table.column(name, "number") for name in (*kind.names(), "rrse", "chi2")}
+    changes = [f"{name}_change" for name in (*kind.names(), "amplitude")]
+    single = (*kind.names(), "rrse", "chi2", *changes)
+    columns |= {name: table.column(name, "number") for name in single}
     columns["steps"] = table.column("steps", "integer")
     for name in ("cov", "shared_cov"):
         columns[name] = table.column(name, "number", (size, size))
-    if "remarks" in table:  # not in files of schema version 1.0
-        columns["remarks"] = table.column("remarks", "text")
-    changes = [f"{name}_change" for name in (*kind.names(), "amplitude")]
-    if "change_stderr" in table:  # not before schema version 1.2
-        columns |= {name: table.column(name, "number") for name in changes}
-        columns["change_stderr"] = table.column("change_stderr", "number", (size + 1,))
-    if "outside" in table:  # only for fits with bounds, and not before schema version 1.4
+    columns["change_stderr"] = table.column("change_stderr", "number", (size + 1,))
+    if "outside" in table:  # only for fits with bounds
         columns |= {name: table.column(name, "number", (size,)) for name in LIMITS}
-    count = same_length(table, columns)
+    same_length(table, columns)
     read = {name: table.read(column) for name, column in columns.items()}
-    remarks = _remarks(table, read.get("remarks", np.full(count, "")))
-    numbers = (*kind.names(), "rrse", "chi2", "cov", "shared_cov")
+    numbers = (*single, "cov", "shared_cov", "change_stderr")
     real = {name: read[name].astype(float) for name in numbers}
     # Steiglitz-McBride may give others negative elements, and an element without effect may be 0.
     successful = read["verdict"] == "successful"
@@ -100,16 +96,17 @@ def columns_of(
                 field=name,
                 remedy="The file is damaged: copy it again, or fit the recordings again",
             )
-    fields = {name: real[name] for name in numbers} | {
+    real["change"] = np.stack([real.pop(name) for name in changes], axis=1)
+    fields = real | {
         "result": _verdicts(table, read["verdict"]),
         "steps": read["steps"],
         "method": table.text("method"),
-        "remarks": remarks,
+        "remarks": _remarks(table, read["remarks"]),
     }
     if "outside" in read:
         fields["limits"] = Limited(**{name: read[name].astype(float) for name in LIMITS})
     labels = {name: read[name] for name in DESCRIBED}
-    return kind, fields | _changes_of(read, changes), labels, read["note"]
+    return kind, fields, labels, read["note"]
 
 
 def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[AbstractCircuit]:
@@ -158,11 +155,3 @@ def _remarks(table: Table, texts: np.ndarray) -> np.ndarray:
             field="remarks",
             remedy="Read it with the etid that wrote it",
         ) from None
-
-
-def _changes_of(read: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, Any]:
-    """The changes in a file of fits; empty for files before schema version 1.2."""
-    if "change_stderr" not in read:
-        return {}
-    change = np.stack([read[name].astype(float) for name in names], axis=1)
-    return {"change": change, "change_stderr": read["change_stderr"].astype(float)}

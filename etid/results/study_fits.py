@@ -66,9 +66,8 @@ class Settings:
         precision: Floating-point type of the computation.
         backend: Backend of JAX, such as `"cpu"`.
         versions: Packages and their versions, such as `"jax 0.10.2"`.
-        plausible: As in `identify_driver`. Files of earlier versions do not store it.
-        instrument: Tolerances of the instrument that are not 0 [SI], such as `"gain 0.001"`. Files
-            of earlier versions do not store them.
+        plausible: As in `identify_driver`.
+        instrument: Tolerances of the instrument that are not 0 [SI], such as `"gain 0.001"`.
         driver: Absolute path of the file of the driver; empty if the recordings name their own
             calibrations.
     """
@@ -175,7 +174,7 @@ class StudyFits(Overviewed):
     def read(
         cls, path: str | os.PathLike[str], circuit: type[AbstractCircuit] | None = None
     ) -> "StudyFits":
-        """Read a file of fits. Fields that an older file does not have are empty.
+        """Read a file of fits; one of `Fits.write` has neither drivers nor settings.
 
         Args:
             path: The file.
@@ -208,11 +207,9 @@ class StudyFits(Overviewed):
 
 
 def _settings(table: Table) -> Settings | None:
-    fields = dataclasses.fields(Settings)
-    required = {field.name for field in fields if field.default is dataclasses.MISSING}
-    if not table.attributes >= required:
+    kinds = {field.name: field.type for field in dataclasses.fields(Settings)}
+    if not table.attributes >= kinds.keys():
         return None
-    kinds = {field.name: field.type for field in fields if field.name in table.attributes}
     values: dict[str, Any] = {}
     for name, kind in kinds.items():
         value = table.attribute(name)
@@ -228,11 +225,6 @@ def _settings(table: Table) -> Settings | None:
                 remedy=REMEDY,
             )
         values[name] = tuple(items) if several else value
-    # Earlier versions stored these tolerances apart.
-    for name, former in (("r_load", "r_load_tolerance"), ("drift", "driver_drift")):
-        part = table.attribute(former) if former in table.attributes else 0.0
-        if isinstance(part, float) and part > 0:
-            values["instrument"] = (*values.get("instrument", ()), f"{name} {part!r}")
     return Settings(**values)
 
 
@@ -299,15 +291,12 @@ def _from_json(stored: Mapping[str, Any]) -> Driver:
         result=verdicts_of(np.asarray(stored["verdict"])),
         steps=jax.device_put(np.asarray(_numbers(stored, "steps")).astype(int)),
         method=stored["method"],
-        remarks=np.asarray(remarks_of(stored.get("remarks", ""))),
+        remarks=np.asarray(remarks_of(stored["remarks"])),
     )
 
 
 def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
-    """`ContinuousDriver` with the fields that a discrete driver does not have.
-
-    Files of earlier versions have no instrument and no orders that were tried, and a drift apart.
-    """
+    """`ContinuousDriver` with the fields that a discrete driver does not have."""
     own = stored["source"]
     pairs = _numbers(own, "log_omega", None).size
     reals = _numbers(own, "log_omega_real", None).size
@@ -319,29 +308,22 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
     size = 1 + 4 * pairs + 2 * reals
     r_load = _numbers(stored, "r_load", None)
     delays = _numbers(stored, "delay_samples", r_load.size), _numbers(stored, "delay_std_samples")
-    instrument, tried = None, OrderEvidence.none()
-    told: Mapping[str, Any] = stored.get("instrument") or {}
-    numbers = {name: float(_numbers(told, name)) for name in TOLERANCES if name in told}
-    if stored.get("drift") is not None:
-        numbers["drift"] = float(_numbers(stored, "drift"))
-    if numbers or stored.get("instrument") is not None:
+    instrument, told = None, stored["instrument"]
+    if told is not None:
+        numbers = {name: float(_numbers(told, name)) for name in TOLERANCES if name in told}
         instrument = Instrument(**numbers).as_arrays()
-    if "tried" in stored:
-        of, orders = stored["tried"], tried.bic.size
-        adequate = np.asarray(of["adequate"])
-        if adequate.dtype.kind != "b" or adequate.shape != (orders,):
-            raise TypeError(f"adequate is {reprlib.repr(of['adequate'])}")
-        bic, missing_pole = (
-            np.asarray(_numbers(of, name, orders)) for name in ("bic", "missing_pole")
-        )
-        tried = OrderEvidence(bic, missing_pole, adequate)
+    of, orders = stored["tried"], OrderEvidence.none().bic.size
+    adequate = np.asarray(of["adequate"])
+    if adequate.dtype.kind != "b" or adequate.shape != (orders,):
+        raise TypeError(f"adequate is {reprlib.repr(of['adequate'])}")
+    bic, missing_pole = (np.asarray(_numbers(of, name, orders)) for name in ("bic", "missing_pole"))
     return functools.partial(
         ContinuousDriver,
         source=source,
         cov=_numbers(stored, "cov", size, size),
         calibration=Calibration(r_load, *delays),
         instrument=instrument,
-        tried=tried,
+        tried=OrderEvidence(bic, missing_pole, adequate),
     )
 
 
