@@ -376,7 +376,7 @@ def taken(whole: _Tree, rows: int | Sequence[int] | np.ndarray) -> _Tree:
     return jax.tree.map(lambda leaf: np.asarray(leaf[rows]), whole)
 
 
-def replaced(whole: _Tree, rows: Sequence[int], others: _Tree) -> _Tree:
+def replaced(whole: _Tree, rows: Sequence[int] | np.ndarray, others: _Tree) -> _Tree:
     """The lanes or fits along the leading axis, some of them replaced."""
 
     def one(leaf: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -30,7 +30,9 @@ from etid.estimators.lanes import (
     Harmonics,
     HarmonicsWithCurrent,
     Lags,
+    replaced,
     stacked,
+    taken,
     unstacked,
 )
 from etid.estimators.maximum_likelihood import given_driver
@@ -202,15 +204,6 @@ def _successful(fits: Fit) -> Bool[np.ndarray, " lane"]:
     return verdict_names(fits.result) == "successful"
 
 
-def _replaced(fits: Fit, others: Fit, where: Bool[np.ndarray, " lane"]) -> Fit:
-    """Fits of a group, some of them replaced by others."""
-
-    def one(leaf: np.ndarray, other: np.ndarray) -> np.ndarray:
-        return np.where(where.reshape(-1, *[1] * (leaf.ndim - 1)), other, leaf)
-
-    return jax.tree.map(one, fits, others)
-
-
 def _key(one: Prepared) -> tuple[Any, ...]:
     """Equal for recordings of one group: their harmonics are the same."""
     return one.seen.v_th.size, *one.key
@@ -258,8 +251,7 @@ class _Group:
         return [key for key, count in Counter(self.unloaded).items() if count > 1]
 
     def loads(self) -> Loads:
-        starts = [start.loads for start in self.starts]
-        loads = jax.tree.map(lambda *parts: np.stack(parts), *starts)
+        loads = stacked([start.loads for start in self.starts])
         number = {key: i for i, key in enumerate(self.several())}
         unloaded = np.array([number.get(key, -1) for key in self.unloaded])
         return eqx.tree_at(lambda of: of.unloaded, loads, unloaded)
@@ -431,7 +423,10 @@ def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit]
         small = [
             _successful(one) & _successful(other) for one, other in zip(found, others, strict=True)
         ]
-        found = [_replaced(*of_group) for of_group in zip(found, others, small, strict=True)]
+        found = [
+            replaced(first, where, taken(second, where))
+            for first, second, where in zip(found, others, small, strict=True)
+        ]
     # A compiled function returns JAX arrays. The checksums must stay a numpy array.
     better = dataclasses.replace(better, method=METHOD, unloaded=driver.unloaded)
     changed = any(any(group.changed) for group in groups)
