@@ -181,6 +181,19 @@ class AbstractCircuit(Overviewed, eqx.Module):
 Circuit = TypeVar("Circuit", bound=AbstractCircuit)
 
 
+def with_slopes(
+    circuit: AbstractCircuit, logs: Float[Array, " element"], frequency: Float[Array, " band"]
+) -> tuple[Complex[Array, " band"], Complex[Array, "element band"]]:
+    """Z [Ω] of a circuit whose elements have these logarithms, and its derivatives by them."""
+    s = frequency_variable(frequency)
+
+    def z(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
+        return circuit.with_log_values(logs).impedance()(s)
+
+    along = jax.vmap(lambda way: jax.jvp(z, (logs,), (way,)), out_axes=(None, 0))
+    return along(np.eye(logs.size))
+
+
 @functools.cache
 def _has_exponents(kind: type[AbstractCircuit]) -> bool:
     """Whether the impedance of a class has exponents; building an impedance takes long."""

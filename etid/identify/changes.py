@@ -25,11 +25,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, with_slopes
 from etid.estimators.score_tests import FALSE_ALARMS
 from etid.numpy_tier.tiers import program
 from etid.recordings.repeats import ALIGNED, Repeats
@@ -38,7 +37,7 @@ from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import real_parts
-from etid.signals.transfer import frequency_variable, reciprocal
+from etid.signals.transfer import reciprocal
 
 CLEAN = 0.03  # of the sample rate; below, there are no aliases
 UNEQUAL = 5e-4  # largest change of the amplitude of V_th; cuts between samples cause 1e-4
@@ -81,16 +80,9 @@ def log_slopes(
     circuits: AbstractCircuit, driver: AbstractFeed, frequency: Float[Array, " band"]
 ) -> Complex[Array, "lane element band"]:
     """∂ ln G/∂ ln q of the elements of circuits along a leading axis."""
-    s = frequency_variable(frequency)
 
     def of(circuit: AbstractCircuit) -> Complex[Array, "element band"]:
-        logs = circuit.log_values()
-
-        def z(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
-            return circuit.with_log_values(logs).impedance()(s)
-
-        along = jax.vmap(lambda way: jax.jvp(z, (logs,), (way,)), out_axes=(None, 0))
-        load, by_element = along(jnp.eye(logs.size))
+        load, by_element = with_slopes(circuit, circuit.log_values(), frequency)
         return by_element * (driver.sensitivity(load, frequency) * reciprocal(load))[None, :]
 
     return jax.vmap(of)(circuits)

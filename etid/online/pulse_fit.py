@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, with_slopes
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.unknowns import LoadUnknowns
@@ -114,12 +114,7 @@ class GainModel(eqx.Module):
 
     def expected(self, logs: Float[Array, " element"]) -> "Expected":
         """The gain of a load, and its derivatives."""
-
-        def load(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
-            return self.circuit.with_log_values(logs).response(self.bands.frequency)
-
-        z = load(logs)
-        by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
+        z, by_element = with_slopes(self.circuit, logs, self.bands.frequency)
         admittance = reciprocal(z + self.source)
         slope = by_element * (self.source * admittance * admittance)[None, :]
         above = self.circuit.with_log_values(logs).response(

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, with_slopes
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH
@@ -194,12 +194,8 @@ class Gains(eqx.Module):
         """The gains and their derivatives."""
         logs, _, z = self.split(q)
         s, w, faults = frequency_variable(self.frequency), self.w(z), self.faults(z)
-
-        def load(logs: Float[Array, " element"]) -> Complex[Array, " frequency"]:
-            return self.circuit.with_log_values(logs).impedance()(s)
-
-        z_load, one = load(logs), jnp.ones_like(s)
-        by_element = jax.vmap(lambda way: jax.jvp(load, (logs,), (way,))[1])(np.eye(logs.size))
+        z_load, by_element = with_slopes(self.circuit, logs, self.frequency)
+        one = jnp.ones_like(s)
         value, by_load = jax.jvp(lambda at: self._undelayed(at, w, faults), (z_load,), (one,))
         by_w = jax.jvp(lambda at: self._undelayed(z_load, at, faults), (w,), (one,))[1]
         value, by_load, by_w = (self.turned(q, of, self.frequency) for of in (value, by_load, by_w))
