@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from etid.estimators.estimator import AbstractEstimator, serving
 from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
@@ -147,7 +147,7 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
         driver = dataclasses.replace(driver, unloaded=unloaded)
     periods = repeats(seen)
     at = np.append(changes.bands(periods), 1e3)
-    *z_th, at_1_khz = np.asarray(_response(driver, jax.device_put(at)))
+    *z_th, at_1_khz = np.asarray(driver.response(jax.device_put(at)))
     driver = changes.driver_judged(
         driver, np.asarray(resistances), periods, np.array(z_th, complex)
     )
@@ -261,14 +261,6 @@ def with_harmonics(driver: ContinuousDriver, calibrations: Sequence[Recording]) 
 def _clear(records: Harmonics) -> Spectrum:
     """The harmonics that a driver is refined with."""
     return above_noise(records.spectrum, banded(records.spectrum))
-
-
-@program
-def _response(
-    driver: Driver, frequency: Float[Array, " frequency"]
-) -> Complex[Array, " frequency"]:
-    """Z_th [Ω] at these frequencies [Hz]."""
-    return driver.response(frequency)
 
 
 @program
