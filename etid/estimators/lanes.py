@@ -46,9 +46,6 @@ class Lags(NamedTuple):
         return cls(*(round(by) if abs(by) > LEFT else 0 for by in late))
 
 
-IN_TIME = Lags(0)
-
-
 class AbstractLane(eqx.Module):
     """The arrays that an estimator fits: of one recording, or of several along a leading axis.
 
@@ -95,7 +92,7 @@ class AbstractLane(eqx.Module):
         a sample or more, the fit finds the elements, but its verdict is `misfit`.
         """
         del circuit, driver
-        return IN_TIME
+        return Lags(0)
 
     def without_mains(self) -> "AbstractLane | None":
         """The same without the harmonics on which mains hum may fall; None if there is none."""

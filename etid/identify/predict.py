@@ -74,7 +74,7 @@ def predict(
     seen, simulated = Inspected(recording), load.impedance().has_response
     if not load.is_rational and (seen.whole_periods[0] > 0 or not simulated):
         if isinstance(feed, ContinuousDriver):
-            return _predict_periods(recording, feed, load)
+            return _predict_periods(seen, feed, load)
         OUTPUT_ERROR.check_circuit(load)
     seen.kept = None  # disturbed periods are predicted too
     inner = np.asarray(_fitted(jax.device_put(AlignedSamples.of(seen)), feed, load))
@@ -85,10 +85,9 @@ def predict(
 
 
 def _predict_periods(
-    recording: Recording, driver: ContinuousDriver, circuit: AbstractCircuit
+    seen: Inspected, driver: ContinuousDriver, circuit: AbstractCircuit
 ) -> Float[np.ndarray, " time"]:
-    rate = recording.sample_rate
-    seen = Inspected(recording)
+    recording, rate = seen.recording, seen.recording.sample_rate
     periods, samples = seen.whole_periods
     if periods == 0:
         raise ValueError(
