@@ -47,7 +47,7 @@ EXPLAINED = (
     "inconsistent",
     "biased",
 )  # verdicts that a change may cause
-LANES = 64  # circuits of one call
+LANES = 64  # lanes or circuits of one call; the last call is padded
 RIDGE = 1e-10  # added to the diagonal, for elements without effect
 LARGEST = 20.0  # limit on the change of a logarithm; an undetermined change can be arbitrary
 USUAL = 12.0  # χ² that exceeds its mean by no more is never unlikely

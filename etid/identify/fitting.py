@@ -35,6 +35,7 @@ from etid.estimators.lanes import (
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.identify import changes
+from etid.identify.changes import LANES
 from etid.identify.second_minimum import ASIDE, likelier
 from etid.numpy_tier.tiers import program, worth_compiling
 from etid.recordings.causes import LOG, log_changes
@@ -48,7 +49,6 @@ from etid.results.verdicts import message, verdicts_of
 from etid.selection.evidence import best
 from etid.selection.search import search
 
-LANES = 64  # lanes of one call; the last call is padded
 FEWEST = 16  # recordings that are read and fitted at once, however long they are
 HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least `FEWEST`
 SPARSE = 16  # every 16th sample enters a checksum
