@@ -41,9 +41,9 @@ class Lags(NamedTuple):
     current: int = 0
 
     @classmethod
-    def of(cls, *late: float) -> "Lags":
-        """Delays rounded to whole samples; 0 up to `LEFT`."""
-        return cls(*(round(by) if abs(by) > LEFT else 0 for by in late))
+    def of(cls, *late: float, left: float = LEFT) -> "Lags":
+        """Delays rounded to whole samples; 0 up to `left` and if they are not finite."""
+        return cls(*(round(by) if left < abs(by) < math.inf else 0 for by in late))
 
 
 class AbstractLane(eqx.Module):

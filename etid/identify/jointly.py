@@ -259,16 +259,9 @@ class _Group:
 
 def _late_by(lanes: Sequence[AbstractLane], starts: Sequence[_Start]) -> dict[int, Lags]:
     del lanes
+    each = [map(float, start.loads.own.delays()) for start in starts]
     # A fit allows for one sample.
-    late = {
-        row: Lags(
-            *(
-                round(by) if 1 < abs(by) < np.inf else 0
-                for by in map(float, start.loads.own.delays())
-            )
-        )
-        for row, start in enumerate(starts)
-    }
+    late = {row: Lags.of(*of, left=1.0) for row, of in enumerate(each)}
     return {row: by for row, by in late.items() if any(by)}
 
 
