@@ -282,7 +282,7 @@ def _contradictions(
             jax.tree.map(lambda leaf, part=part: leaf[part], found) for part in (slice(-1), -1)
         )
         scale = of_current.contradicts()
-    other = other_circuit.Scores.of(found, gain=True)
+    other = other_circuit.Scores.of(found)
     # A load that takes no part has its own verdict.
     return (other.seen() | other.has_other_gain()) & load.used, scale & load.used
 

@@ -88,7 +88,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
         jax.tree.map(lambda leaf, which=which: leaf[which], found)
         for which in (slice(1 - load.gains.outputs or None), slice(-load.gains.outputs, None))
     )
-    other = other_circuit.Scores.of(of_circuit, gain=True)
+    other = other_circuit.Scores.of(of_circuit)
     falling = falling_resistance.score(
         by_falling(load, near),
         profile,
@@ -188,7 +188,7 @@ def other_circuit_at(
     linear, _ = _linear(load, near, near.profile.excess(load.records))
     rows = near.condensed.rows(changes(load, near))
     found = _scores(load, near, linear, linear.bread(), rows)
-    return other_circuit.Scores.of(found, gain=True).seen()
+    return other_circuit.Scores.of(found).seen()
 
 
 def _scores(

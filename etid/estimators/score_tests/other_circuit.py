@@ -130,21 +130,21 @@ class Scores(NamedTuple):
     Attributes:
         spread: Score of the spread.
         relaxation: Scores of one more relaxation, for each time constant.
-        gain: Score of the gain of V_out; None if it is not tested.
+        gain: Score of the gain of V_out.
     """
 
     spread: Score
     relaxation: Score
-    gain: Score | None
+    gain: Score
 
     @classmethod
-    def of(cls, scores: Score, gain: bool = False) -> "Scores":
-        """Name the scores of all `changes`; `gain` says whether that of a gain follows them."""
+    def of(cls, scores: Score) -> "Scores":
+        """Name the scores of all `changes`, which that of a gain follows."""
 
         def part(which: int | slice) -> Score:
             return jax.tree.map(lambda leaf: leaf[which], scores)
 
-        return cls(part(0), part(slice(1, -1 if gain else None)), part(-1) if gain else None)
+        return cls(part(0), part(slice(1, -1)), part(-1))
 
     def seen(self) -> Bool[Array, ""]:
         """Whether the scores show another circuit."""
@@ -152,15 +152,14 @@ class Scores(NamedTuple):
         return spread | self.relaxation.relaxes()
 
     def relevant(self) -> Float[Array, " change"]:
-        """Z of all changes; 0 if a change is too small to matter, or is not tested."""
-        gain = jnp.zeros_like(self.spread.z) if self.gain is None else self.gain.relevant()
+        """Z of all changes; 0 if a change is too small to matter."""
         spread = jnp.where(jnp.abs(self.spread.size) > SPREAD, self.spread.z, 0.0)
-        parts = jnp.nan_to_num(spread), self.relaxation.relevant(), gain
+        parts = jnp.nan_to_num(spread), self.relaxation.relevant(), self.gain.relevant()
         return jnp.concatenate([jnp.atleast_1d(part) for part in parts])
 
     def has_other_gain(self) -> Bool[Array, ""]:
         """Whether the score shows that V_out and V_th have different gains."""
-        return jnp.asarray(False) if self.gain is None else self.gain.exceeds(SEEN)
+        return self.gain.exceeds(SEEN)
 
 
 def scores(
@@ -171,7 +170,6 @@ def scores(
     spread: Float[Array, "q q"],
     covariance: Float[Array, "q q"],
     elements: slice,
-    together: Float[Array, "cause term"] | None = None,
 ) -> Score:
     """Score of each change.
 
@@ -186,8 +184,6 @@ def scores(
         spread: Covariance of this gradient.
         covariance: Inverse of the information, including that of other terms.
         elements: Slice of the parameters that are the logarithms of the elements.
-        together: Effects on the terms of causes that move many terms at once, each with a standard
-            deviation of 1, such as the drift of a driver; None if there are none.
     """
     directions, others = linear.projected(rows, covariance)
     score = directions @ residual - others @ rest
@@ -200,8 +196,6 @@ def scores(
     size = score / curvature
     slope = -others[:, elements]
     moved = jnp.abs(size) * jnp.max(jnp.abs(slope), axis=1)
-    if together is not None:
-        variance = variance + jnp.sum((directions @ together.T) ** 2, axis=1)
     deviation = jnp.sqrt(variance)
     z = jnp.where(can, jnp.nan, score / deviation)
     return Score(z, size, moved, deviation / curvature, slope)
