@@ -143,13 +143,12 @@ def test_the_magnitude_as_printed_costs_what_it_costs():
         printed = (2 * r_s + r_p) / np.sqrt(2)
 
         z, corner = circuit.impedance(), 1 / (r_p * c_p)
-        omega = scipy.optimize.brentq(
+        found = scipy.optimize.root_scalar(
             lambda omega, z, printed: abs(complex(z(jnp.asarray(1j * omega)))) - printed,
-            0.1 * corner,
-            corner,
+            bracket=(0.1 * corner, corner),
             args=(z, printed),
         )
-        excess.append(1 / (r_p * omega) / c_p - 1)
+        excess.append(1 / (r_p * found.root) / c_p - 1)
     np.testing.assert_allclose(excess, [0.38, 0.88], atol=0.01)
 
 

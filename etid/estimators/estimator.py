@@ -175,15 +175,13 @@ class AbstractEstimator(abc.ABC):
                 "use method='maximum_likelihood'"
             )
 
-    def check_driver(self, driver: AbstractFeed, sample_rate: float, pulse_rate: float) -> None:
+    def check_driver(self, driver: AbstractFeed, sample_rate: float) -> None:
         """Raise ValueError unless this estimator can use the driver for a recording.
 
         Args:
             driver: The driver, or the measured current.
             sample_rate: Sampling rate of the recording [Hz].
-            pulse_rate: Pulse rate of the recording [Hz].
         """
-        del pulse_rate
         if self.current and isinstance(driver, MeasuredCurrent):
             return
         found = serving(driver, self.driver, str(self))

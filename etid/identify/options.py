@@ -353,7 +353,7 @@ def plan(
             name = "biased"
     if name is None and estimator.lane.periodic and seen.is_aliased:
         name = "biased"
-    estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
+    estimator.check_driver(driver, seen.recording.sample_rate)
     if isinstance(driver, ContinuousDriver) and issubclass(estimator.driver, ContinuousDriver):
         check_instrument(driver.instrument, estimator)
     return options.given_to(estimator), name

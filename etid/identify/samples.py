@@ -64,7 +64,7 @@ def identify_samples(
     if estimator is None:
         estimator = _default(driver, periods[0])
         check_default(estimator, options.circuits)
-    estimator.check_driver(driver, sample_rate, pulse_rate)
+    estimator.check_driver(driver, sample_rate)
     v_th, v_out, step, rate = (
         jnp.asarray(value, float) for value in (v_th, v_out, resolution, sample_rate)
     )

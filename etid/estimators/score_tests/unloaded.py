@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.profile import excess
-from etid.results.driver import Driver, HarmonicDriver
+from etid.results.driver import HarmonicDriver
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, power, turns
 
@@ -117,11 +117,11 @@ def shape(spectrum: Spectrum, drift: Float[Array | np.ndarray, ""] | None = None
     return UnloadedShape(f, x, spectrum.variance_x, directions, bias, made)
 
 
-def shape_of(driver: Driver, frequency: Float[Array, " harmonic"]) -> UnloadedShape | None:
+def shape_of(driver: HarmonicDriver, frequency: Float[Array, " harmonic"]) -> UnloadedShape | None:
     """The unloaded voltage of the first calibration of a driver, for loads of these harmonics [Hz].
 
-    None if the driver has no harmonics, or another number than the loads.
+    None if the driver has another number of harmonics than the loads.
     """
-    if not isinstance(driver, HarmonicDriver) or driver.spectra.x.shape[1:] != frequency.shape:
+    if driver.spectra.x.shape[1:] != frequency.shape:
         return None
     return shape(jax.tree.map(lambda leaf: leaf[0], driver.spectra), driver.drift)
