@@ -119,7 +119,7 @@ def selection(**verdicts: str) -> etid.Selection:
     found = {}
     for number, circuit, deviance in ((0, NEAREST, 2600.0), (3, SPREAD, 2000.0)):
         verdict = verdicts.get(type(circuit).__name__, "successful")
-        unseen = np.zeros(CHANGES), np.array(0.0), np.zeros(len(circuit.names()))
+        unseen = (np.zeros(of) for of in (CHANGES, (), len(circuit.names()), ()))
         support = Support(np.array(deviance), np.array(2e3), *unseen)
         one = fit(verdict, circuit, 0.01)
         found[number] = dataclasses.replace(one, chi2=np.array(deviance / 2e3), support=support)

@@ -220,7 +220,7 @@ def test_a_choice_compares_each_circuit_inside_its_own_bounds(noisy, free):
     chosen = etid.select_circuit(noisy, candidates=candidates, bounds=inside)
     assert type(chosen.fit.circuit) is etid.SkinRC
     of = estimate(relative=(0.05, 0.02, 0.03))
-    support = Support(jnp.array(10.0), jnp.array(100.0), jnp.zeros(9), jnp.zeros(()), jnp.zeros(3))
+    support = Support(jnp.array(10.0), jnp.array(100.0), *[jnp.zeros(of) for of in (9, (), 3, ())])
     of = dataclasses.replace(of, support=support)
     alone = judged(of, etid.SkinRC(), SUCCESSFUL, "a method")
     bounds = ("r_s", above(alone, 2.0), np.inf), ("r", 1.0, 2.0)

@@ -42,6 +42,15 @@ def test_the_slope_is_that_of_a_constant_phase_and_of_the_asymmetry_of_one():
         np.testing.assert_allclose(slope, expected, rtol=1e-7)  # step², and rounding over step
 
 
+def test_a_relaxation_becomes_a_layer_of_diffusion():
+    r_p, tau, f = 1e5, 90e-6, np.geomspace(60.0, 1e6, 30)
+    slowest = etid.ParallelRC(8 / np.pi**2 * r_p, tau / (2 * r_p))
+    change = other_circuit.layer(slowest.impedance(), jnp.asarray(f))
+    root = np.sqrt(2j * np.pi * f * tau)
+    left = np.asarray(slowest.response(f)) + np.asarray(change) - r_p * np.tanh(root) / root
+    assert np.max(np.abs(left)) < 0.04 * r_p  # still faster relaxations
+
+
 def scores(residual, rows, jacobian):
     """Without priors, in white noise of known size."""
     q = jacobian.shape[0]

@@ -188,10 +188,8 @@ def _remarks(z: Complex[np.ndarray, " frequency"]) -> Remark:
 
 def _support(deviance: Float[Array, ""], values: int, elements: int) -> Support:
     """The likelihood of a fit; no changes of the circuit are tested."""
-    nothing = jnp.zeros(())
-    return Support(
-        deviance, jnp.asarray(2.0 * values), jnp.zeros(CHANGES), nothing, jnp.zeros(elements)
-    )
+    nothing, terms = jnp.zeros(()), jnp.asarray(2.0 * values)
+    return Support(deviance, terms, jnp.zeros(CHANGES), nothing, jnp.zeros(elements), nothing)
 
 
 @in_float64

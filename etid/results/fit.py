@@ -74,6 +74,8 @@ class Support(eqx.Module):
         spread_stderr: Standard error of the size of the first change, the spread; 0 if the circuit
             can make it itself.
         spread_slope: Change of the logarithm of each element for each unit of this size.
+        layer_shows: How much the data would show that the load is a layer through which charge
+            diffuses, in place of the circuit [standard deviations]; 0 if this is not tested.
     """
 
     deviance: Float[Array | np.ndarray, "*lane"]
@@ -81,11 +83,12 @@ class Support(eqx.Module):
     z: Float[Array | np.ndarray, "*lane change"]
     spread_stderr: Float[Array | np.ndarray, "*lane"]
     spread_slope: Float[Array | np.ndarray, "*lane element"]
+    layer_shows: Float[Array | np.ndarray, "*lane"]
 
     @classmethod
     def unknown(cls, elements: int, *lane: int) -> "Support":
         """The support of a fit whose estimator does not compute it, or of a batch of them: NaN."""
-        sizes = (), (), (CHANGES,), (), (elements,)
+        sizes = (), (), (CHANGES,), (), (elements,), ()
         return cls(*(np.full((*lane, *size), np.nan) for size in sizes))
 
     def _passive(self) -> Float[np.ndarray, " change"]:

@@ -5,8 +5,9 @@ further fit, show a change that its circuit cannot make, all candidates with as 
 elements are fitted: the weight of a circuit means nothing while a likelier one may be missing. The
 simpler ones are fitted if an element is hardly determined. Those with as many elements are fitted
 where noise could hide them from the tests: behind damp skin at 40 dB, a layer through which charge
-diffuses looks like R_s + R_p ‖ C_p with half more R_s. A recording at 60 dB thus needs one fit.
-Records of millions of samples end the search after `PATIENCE`, with what was found so far.
+diffuses looks like R_s + R_p ‖ C_p with half more R_s. The fit tells how much such a layer would
+show. Dry skin at 40 dB thus needs one fit. Records of millions of samples end the search after
+`PATIENCE`, with what was found so far.
 """
 
 import time
@@ -39,12 +40,12 @@ USUAL: tuple[type[AbstractCircuit], ...] = (
 # Standard deviations of a score that asks for another circuit. The evidence needs 2.8 for one more
 # element; the score is not the ratio of likelihoods exactly.
 ASKS = 2.8
-# Relative standard error of an element that asks for a simpler circuit: an element of seven
-# standard errors has the evidence 49, more than its penalty by far.
+# Relative standard error of an element that asks for simpler circuits, and for those with as many
+# elements: an element of seven standard errors has the evidence 49, more than its penalty by far.
 DOUBTFUL = 1 / 7
-# Relative standard error of an element that another circuit with as many elements may hide in. The
-# evidence against a diffusive layer in place of damp skin is at least 5e-4 over its square for R_s.
-ROUGH = 4e-3
+# Standard deviations that a layer of diffusion would show, from which on it cannot hide: the
+# evidence for or against it is their square, and `ASKS` of them ask for it.
+SHOWS = 7.0
 PATIENCE = 60.0  # [s] for each recording, after which no further candidate is fitted
 FitRows = Callable[[int, Sequence[int]], Sequence[Fit]]
 
@@ -84,13 +85,13 @@ def asked(fits: Mapping[int, Fit], candidates: Sequence[AbstractCircuit]) -> lis
         return []
     number = best(fits)
     fit, own = fits[number], size[number]
-    accepted = rank(fit)
+    accepted, known = rank(fit), _is_known(fit)
     more = []
     if accepted == 2 or _lacks(fit) > ASKS:
         more += [number for number in left if size[number] >= own]
-    elif not _is_known(fit, ROUGH):
+    elif not known or fit.support is None or not fit.support.layer_shows > SHOWS:
         more += [number for number in left if size[number] == own]
-    if accepted == 1 or not _is_known(fit, DOUBTFUL):
+    if accepted == 1 or not known:
         more += [number for number in left if size[number] < own]
     return more
 
@@ -105,8 +106,8 @@ def _lacks(fit: Fit) -> float:
     return float(np.nanmax(np.abs(z), initial=0.0))
 
 
-def _is_known(fit: Fit, part: float) -> bool:
-    """Whether the standard error of each element is less than this part of it."""
+def _is_known(fit: Fit) -> bool:
+    """Whether the standard error of each element is less than `DOUBTFUL`."""
     errors = np.sqrt(np.diagonal(np.asarray(fit.cov)))
     # An error of 0 belongs to an element without any effect.
-    return bool(((errors > 0) & (errors < part * values_of(fit))).all())
+    return bool(((errors > 0) & (errors < DOUBTFUL * values_of(fit))).all())

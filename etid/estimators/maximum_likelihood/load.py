@@ -135,6 +135,13 @@ def changes(load: Load, near: Near) -> Complex[Array, "change output knot"]:
     return jnp.concatenate([circuits[:, None] * near.slopes.by_z[None], scales])
 
 
+def by_layer(load: Load, near: Near) -> Complex[Array, "1 output knot"]:
+    """Derivatives of the gains with respect to a layer of diffusion in place of the circuit."""
+    frequency = load.knots.at(load.gains.frequency)
+    change = other_circuit.layer(load.gains.impedance(near.q), frequency)
+    return (change[None] * near.slopes.by_z)[None]
+
+
 def by_falling(load: Load, near: Near) -> Complex[Array, "output harmonic"]:
     """What a resistance that falls with its current adds to the outputs [V²]."""
     slopes, every = near.slopes, load.knots

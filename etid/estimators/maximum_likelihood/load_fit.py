@@ -17,7 +17,7 @@ from etid.estimators.judgement import judged, unless
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.condensed import Near, means
 from etid.estimators.maximum_likelihood.given_driver import around
-from etid.estimators.maximum_likelihood.load import Load, by_falling, changes
+from etid.estimators.maximum_likelihood.load import Load, by_falling, by_layer, changes
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import best_start, minimum
 from etid.estimators.sandwich import Linear
@@ -82,11 +82,12 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     moved = jnp.sqrt(jnp.max(jnp.where(used, power(load.gains.at(every).w(z)), 0.0)))
     rest, spread = _priors(load, at)
     tested = changes(load, near)
-    rows = condensed.rows(tested)
+    rows = condensed.rows(jnp.concatenate([by_layer(load, near), tested]))
     found = _scores(load, near, linear, information, rows)
-    of_circuit, of_scales = (
+    outputs = load.gains.outputs
+    of_layer, of_circuit, of_scales = (
         jax.tree.map(lambda leaf, which=which: leaf[which], found)
-        for which in (slice(1 - load.gains.outputs or None), slice(-load.gains.outputs, None))
+        for which in (0, slice(1, 1 - outputs or None), slice(-outputs, None))
     )
     other = other_circuit.Scores.of(of_circuit)
     falling = falling_resistance.score(
@@ -142,6 +143,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
             terms,
             other.relevant(),
             *other.spread.possible(),
+            of_layer.would_show(),
         ),
     )
     wrong = other.seen() | other.has_other_gain() | falling.seen()
