@@ -15,7 +15,7 @@ from etid.estimators.score_tests.other_circuit import MOVED
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online import alarms, tick
 from etid.online import state as states
-from etid.online.alarms import SEEN_GAIN, GainScore
+from etid.online.alarms import SEEN, SPREAD, Scores
 from etid.online.gain_bands import Bands
 from etid.online.projection import Seen
 from etid.online.pulse_fit import Expected, GainModel
@@ -75,7 +75,7 @@ CASES = [
 # NumPy's arrays stand in the place of JAX's.
 MEASURED: Any = Measured
 ATTEMPT: Any = Attempt
-GAIN_SCORE: Any = GainScore
+SCORES: Any = Scores
 SUSPICION: Any = Suspicion
 RESULT = {"good": GOOD, "bad": BAD, "late": LATE}
 
@@ -90,7 +90,7 @@ def electrode(of: Case) -> tuple[Any, ...]:
         amplitude=0.5,
         offset=0.25,
         shown=np.array([5.0, 6.0]),
-        gain=np.array([30.0, 100.0, 1.0]),
+        scores=np.array([[30.0, 100.0, 1.0], [0.0, 1.0, 1.0]]),
         confirmed=0.7,
         level=0.3,
         variance=0.4,
@@ -115,10 +115,11 @@ def electrode(of: Case) -> tuple[Any, ...]:
         shown=4.0,
         bad=RESULTS.unconnected if of.off else SUCCESSFUL,
     )
-    score = GAIN_SCORE(np.array([-150.0 if of.gain else 1.0, 90.0, 2.0]), np.array([0.5, -8.0]))
-    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, GOOD if of.found else BAD, score)
+    sums = [[-150.0 if of.gain else 1.0, 90.0, 2.0], [1.0, 1.0, 0.0]]
+    scores = SCORES(np.array(sums), np.array([0.5, -8.0]))
+    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, GOOD if of.found else BAD, scores)
     own = np.array([*(OLD[:2] + 1e-3), 0.3]) if of.near else FRESH
-    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, RESULT[of.fresh], score)
+    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, RESULT[of.fresh], scores)
     z = np.array([0.1, 0.2])
     suspected = SUSPICION(of.jump, of.drift, np.array([0.7, 0.8]), 0.02 * BEFORE, 0, z)
     return state, measured, BEFORE, found, fresh, suspected, LIMIT, NUMBER, POWERS
@@ -151,9 +152,9 @@ def expected(of: Case) -> dict[str, Any]:
     elif good or lost:
         mean, mean_cov = 0 * mean, 0 * mean_cov
     begun = not of.running and of.fresh == "late"
-    gain = state["gain"]
+    sums = state["scores"]
     if good:
-        gain = used.gain.sums + (0 if again else gain)
+        sums = used.scores.sums + (0 if again else sums)
     wrong_gain = good and of.gain  # by far, and by chance never
     confirmed = state["confirmed"] if of.silent else 0.0
     if of.running and good and not of.jump and not wrong_gain:
@@ -177,7 +178,7 @@ def expected(of: Case) -> dict[str, Any]:
         "offset": measured.offset,
         "shown": [4.0, 5.0],
         "confirmed": confirmed,
-        "gain": gain,
+        "scores": sums,
         "mean": mean,
         "mean_cov": mean_cov,
         "event": JUMP if jumped else DRIFT if drifted else NONE,
@@ -254,11 +255,11 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
     ]
     bad, delay, decrement, squares, verdict = map(np.array, zip(*rows, strict=True))
     weight, gain = np.array([3.0, 2.0, 0.0]), np.array([1 + 1j, 2j, 5.0])
-    nothing, zero = GainScore(jnp.zeros(3), jnp.zeros(2)), jnp.asarray(0.0)
+    nothing, zero = Scores(jnp.zeros((2, 3)), jnp.zeros(2)), jnp.asarray(0.0)
     model = object.__new__(GainModel)  # only these two fields are read
     object.__setattr__(model, "bands", types.SimpleNamespace(weight=jnp.asarray(weight)))
     object.__setattr__(model, "noise_freedom", jnp.asarray(1000.0))
-    monkeypatch.setattr(GainScore, "of", lambda *_: nothing)
+    monkeypatch.setattr(Scores, "of", lambda *_: nothing)
     monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
     monkeypatch.setattr("etid.online.tick.Pulse", lambda *_: None)
 
@@ -273,7 +274,8 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
             jnp.asarray(gain), variance, jnp.asarray(weight), level, one, zero, one > 0, one, bad
         )
         none = jnp.zeros(3, complex)
-        expected, start = Expected(none, jnp.zeros((2, 3), complex), none), LoadUnknowns.of(logs)
+        expected = Expected(none, jnp.zeros((2, 3), complex), none, none)
+        start = LoadUnknowns.of(logs)
         return attempt(model, measured, start, expected, jnp.zeros(2), jnp.zeros((2, 2)))
 
     numbers = map(jnp.asarray, (delay, decrement, squares))
@@ -289,19 +291,24 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
     np.testing.assert_allclose(found.information, np.tile(np.linalg.inv(spread), every))
 
 
-def test_a_gain_is_wrong_if_all_noise_and_one_that_does_not_matter_are_less():
+def test_a_gain_or_a_spread_is_wrong_if_all_noise_and_one_that_does_not_matter_are_less():
     """The variance is 16 by the pulses and 3² by the calibrations: a standard deviation of 5."""
-    limit = MOVED / (SEEN_GAIN * 5) * 16
+    limit = MOVED / (SEEN * 5) * 16
     for score, moved, wrong in (
-        (SEEN_GAIN * 5.01, [0.0, 9.0], True),
-        (-SEEN_GAIN * 5.01, [-9.0, 0.0], True),
-        (SEEN_GAIN * 4.99, [0.0, 9.0], False),
-        (SEEN_GAIN * 10, [0.0, 1.01 * limit], True),
-        (SEEN_GAIN * 10, [0.0, 0.99 * limit], False),
+        (SEEN * 5.01, [0.0, 9.0], True),
+        (-SEEN * 5.01, [-9.0, 0.0], True),
+        (SEEN * 4.99, [0.0, 9.0], False),
+        (SEEN * 10, [0.0, 1.01 * limit], True),
+        (SEEN * 10, [0.0, 0.99 * limit], False),
         (np.nan, [0.0, 9.0], False),
     ):
-        found = GainScore(jnp.array([score, 16.0, 3.0]), jnp.array(moved))
+        found = Scores(jnp.array([[score, 16.0, 3.0], [0.0, 1.0, 0.0]]), jnp.array(moved))
         assert bool(found.wrong()) == wrong
+    information = 1e6
+    for score, wrong in ((1.01, True), (-1.01, True), (0.99, False)):
+        score *= SEEN * np.sqrt(information) + SPREAD * information
+        sums = jnp.array([[0.0, 1.0, 0.0], [score, information, 0.0]])
+        assert bool(Scores(sums, jnp.zeros(2)).wrong()) == wrong
 
 
 # --- changes --------------------------------------------------------------------------------------
@@ -503,12 +510,12 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(monkeypatch):
     for name in ("departure", "undelayed", "expected"):
         monkeypatch.setattr(GainModel, name, lambda *_: wave)
     measured, model = MEASURED(wave, zero, jnp.ones(3), *[zero] * 6), object.__new__(GainModel)
-    score = GainScore(jnp.zeros(3), two)
+    scores = Scores(jnp.zeros((2, 3)), two)
 
     @jax.jit
     @jax.vmap
     def alone(spread, result):
-        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, score)
+        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, scores)
         monkeypatch.setattr(tick, "attempt", lambda *_: fit)
         return anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two).result
 

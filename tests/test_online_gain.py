@@ -1,19 +1,24 @@
-"""A gain of V_out or an amplitude that is not the stated one, pulse by pulse."""
+"""A gain or an amplitude that is not the stated one, and another circuit, pulse by pulse."""
 
 import dataclasses
+import functools
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
+from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.online_alarms import LOADS, Fingertip
 from etid.online.tracker import Tracker
 from etid.results.verdicts import verdict_names
+from etid.simulation.scenes import Trial
+from tests.test_online import LOADS as SKINS
 from tests.test_online import (
     NOISE,
     TEN,
     after_amplitude,
+    calibrated,
     followed,
     loaded,
     quiet,
@@ -92,14 +97,14 @@ def test_a_gain_that_does_not_matter_is_never_refused():
     tracker, _, clean = ten()
     pulses = with_noise(0.9991 * np.concatenate([clean] * 4), seed=5)
     found, state = verdicts_of_pulses(tracker, pulses)
-    score, information, common = np.asarray(state.electrodes.gain).T
+    score, information, common = np.asarray(state.electrodes.scores)[:, 0].T
     assert (score**2 > 25 * (information + common**2)).any()
     assert set(found.ravel()) == {"successful"}
 
 
 def of_gain(tracker, pulses):
     """Sums of the test after some pulses: s, I and c of each electrode."""
-    return np.asarray(followed(tracker, pulses).electrodes.gain).T
+    return np.asarray(followed(tracker, pulses).electrodes.scores)[:, 0].T
 
 
 def test_the_score_is_that_of_the_gain_and_its_error_that_of_the_driver():
@@ -127,6 +132,30 @@ def test_the_score_is_that_of_the_gain_and_its_error_that_of_the_driver():
     assert (score**2 < 16 * (information + common**2)).all()
 
 
+@pytest.mark.parametrize(
+    "make", [functools.partial(Cole, alpha=0.98), functools.partial(TwoLayers, share=0.05)]
+)
+def test_skin_that_is_not_one_rc_is_refused_within_two_pulses(make):
+    """Cole skin was `successful` with R_s 5 (dry) and 10 % (damp) off, 35 and 54 of its errors."""
+    tracker, *_ = ten()
+    trials = tuple(Trial(name, make(skin)) for name, skin in SKINS.items())
+    quiet = dataclasses.replace(scene(6, snr_db=None, bits=None), trials=trials, start=0.3e-6)
+    clean = np.tile(tracker.pulses(loaded(quiet.simulate(seed=0))), (1, TEN // 2, 1))
+    found, _ = verdicts_of_pulses(tracker, with_noise(clean, seed=3))
+    assert (found[SOON - 1 :] == "misfit").all()
+
+
+def test_a_circuit_without_time_constants_has_no_spread():
+    driver, study = calibrated()
+    tracker = Tracker.of(driver, study["cal/0"], electrodes=1, circuit=etid.Resistor())
+    pulses = tracker.pulses(study["cal/1"].v_out[None])
+    found, state = verdicts_of_pulses(tracker, pulses)
+    assert set(found.ravel()) == {"successful"}
+    gain, spread = np.asarray(state.electrodes.scores)[0]
+    assert (gain[1:] > 0).all()
+    np.testing.assert_array_equal(spread, 0.0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [60.0, 40.0])
 def test_undisturbed_electrodes_are_never_refused_at_a_hundred_thousand_pulses(snr_db):
@@ -137,7 +166,7 @@ def test_undisturbed_electrodes_are_never_refused_at_a_hundred_thousand_pulses(s
     for v_out in display.pulses(np.arange(electrodes) % len(LOADS), 1050):
         state = display.tracker.update(state, v_out)
         assert set(verdict_names(state.electrodes.result)) == {"successful"}
-        score, information, common = np.asarray(state.electrodes.gain).T
+        score, information, common = np.asarray(state.electrodes.scores)[:, 0].T
         squares.append(score**2 / (information + common**2))
     # All have the error of one calibration, so that their z are nearly one number.
     assert np.mean(squares) < 3**2

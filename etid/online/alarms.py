@@ -1,4 +1,4 @@
-"""Tests of the pulses: for a change of skin or driver, and for a gain that is not the stated one.
+"""Tests of the pulses: for a change of skin or driver, for another gain, and for another circuit.
 
 **The innovation** of a pulse is the difference between the logarithms of the elements that this
 pulse alone shows and their prediction:
@@ -52,9 +52,13 @@ has at most the distribution χ² with one degree of freedom. A gain g₀ that m
 `MOVED` does not matter (`etid.estimators.score_tests.other_circuit`), and instruments have smaller
 ones, which many pulses show. So a gain is wrong if it exceeds this one:
 
-    |Σs| − g₀ ΣI  >  SEEN_GAIN √(ΣI + (Σc)²).
+    |Σs| − g₀ ΣI  >  SEEN √(ΣI + (Σc)²).
 
 As in a fit of a whole record, the verdict is then `misfit`.
+
+**Another circuit.** Skin whose time constants are spread (Cole 1940) hides in the same way: with
+α = 0.98, R_s is a tenth off at a χ² that may be noise. Its score is that of the gain with
+d = ∂G/∂α √w / σ, and a spread below `SPREAD` does not matter.
 """
 
 from typing import NamedTuple
@@ -64,7 +68,7 @@ import jax.numpy as jnp
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from etid.estimators.score_tests.other_circuit import MOVED
+from etid.estimators.score_tests.other_circuit import MOVED, NOTHING, SPREAD
 from etid.online.pulse_fit import Expected, Pulse
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, power
@@ -74,7 +78,7 @@ FALSE_ALARMS = 0.05  # per electrode and hour, expected if T and Q have exactly 
 WEIGHT = 0.1  # λ, of the newest innovation in the moving mean
 DRIVER = 9.0  # standard deviations; no false alarm is expected in a year
 COMMON = 8  # electrodes that are needed to tell the driver from the skin
-SEEN_GAIN = 5.3  # standard deviations that noise exceeds once in 10⁷ pulses
+SEEN = 5.3  # standard deviations that noise exceeds once in 10⁷ pulses
 
 
 def limit(elements: int, pulse_rate: float) -> float:
@@ -164,15 +168,15 @@ def driver_change(
     return enough & (moved | (jnp.sum(jumped & counts, dtype=float) > number / 2))
 
 
-class GainScore(NamedTuple):
-    """Score of the gain of one pulse, and sums of several.
+class Scores(NamedTuple):
+    """Scores of a gain and of a spread of one pulse, and sums of several.
 
     Attributes:
-        sums: s, I and c.
-        moved: Change of the logarithms of the elements for each unit of g.
+        sums: s, I and c of each.
+        moved: Change of the logarithms of the elements for each unit of the gain.
     """
 
-    sums: Float[Array, "*lane 3"]
+    sums: Float[Array, "*lane change 3"]
     moved: Float[Array, "*lane element"]
 
     @classmethod
@@ -183,8 +187,8 @@ class GainScore(NamedTuple):
         expected: Expected,
         residual: Float[Array, " part"],
         inverse: Float[Array, "own own"],
-    ) -> "GainScore":
-        """The score of a pulse.
+    ) -> "Scores":
+        """The scores of a pulse.
 
         Args:
             pulse: The objective.
@@ -193,30 +197,33 @@ class GainScore(NamedTuple):
             residual: Residual at the minimum, but for a step along the elements and the delay.
             inverse: (J Jᵀ)⁻¹.
         """
-        gain, model = expected.gain, pulse.model
-        weighted = gain * as_complex(jnp.sqrt(pulse.weight))
-        jacobian, along = pulse.jacobian(expected), real_parts(weighted)
-        others = inverse @ (jacobian @ along)
+        gain, model, weight = expected.gain, pulse.model, as_complex(jnp.sqrt(pulse.weight))
+        jacobian = pulse.jacobian(expected)
+        along = real_parts(jnp.stack([gain, expected.spread]) * weight[None, :])
+        others = along @ jacobian.T @ inverse
         d = along - others @ jacobian
-        score, information = d @ residual, d @ d
-        freedom = 2 * jnp.sum(pulse.weight > 0, dtype=score.dtype) - others.size - 1
-        chi2 = (residual @ residual - score**2 / information) / freedom
+        score, information = d @ residual, jnp.sum(d**2, axis=1)
+        tested = information > NOTHING * jnp.sum(along**2, axis=1)
+        freedom = 2 * jnp.sum(pulse.weight > 0, dtype=score.dtype) - others.shape[1] - 1
+        explained = score**2 / jnp.where(tested, information, 1.0)
+        chi2 = (residual @ residual - explained) / freedom
         # ∂G/∂ log Z_th = −G (1 − G)
-        free = jax.lax.complex(*jnp.split(d, 2))
-        towards = free * jnp.conj(weighted * (1 - gain))
-        of_source = model.source_error.real @ towards.real + model.source_error.imag @ towards.imag
+        free = jax.lax.complex(*jnp.split(d, 2, axis=1))
+        towards = free * jnp.conj(gain * weight * (1 - gain))[None, :]
+        of_source = jnp.tensordot(model.source_error.real, towards.real, [[1], [1]])
+        of_source = of_source + jnp.tensordot(model.source_error.imag, towards.imag, [[1], [1]])
         if model.faults is not None:
-            direct = as_complex(jnp.sqrt(pulse.weight))[None, :] * model.by_fault(gain)
-            of_source = of_source - model.faults @ (direct @ jnp.conj(free)).real
+            direct = weight[None, :] * model.by_fault(gain)
+            of_source = of_source - model.faults @ (direct @ jnp.conj(free).T).real
         of_x = power(gain) * model.bands.variance_x / variance
-        common = jnp.sqrt(of_source @ of_source + d**2 @ jnp.tile(of_x, 2))
+        common = jnp.sqrt(jnp.sum(of_source**2, axis=0) + d**2 @ jnp.tile(of_x, 2))
         # More noise than stated lessens the weight of a pulse, as it does in a fit of a record.
-        sums = jnp.stack([score, information, common]) / jnp.maximum(chi2, 1.0)
-        return cls(sums, -others[:-1])
+        sums = jnp.stack([score, information, common], axis=1) / jnp.maximum(chi2, 1.0)[:, None]
+        return cls(jnp.where(tested[:, None], sums, 0.0), -others[0, :-1])
 
     def wrong(self) -> Bool[Array, ""]:
-        """Whether sums over pulses show another gain that matters."""
-        score, information, common = self.sums
+        """Whether sums over pulses show another gain, or a spread, that matters."""
+        score, information, common = self.sums.T
         scatter = jnp.sqrt(information + common**2)
-        moved = jnp.max(jnp.abs(self.moved))
-        return moved * (jnp.abs(score) - SEEN_GAIN * scatter) > MOVED * information
+        allowed = jnp.stack([MOVED / jnp.max(jnp.abs(self.moved)), jnp.asarray(SPREAD)])
+        return jnp.any(jnp.abs(score) - SEEN * scatter > allowed * information)

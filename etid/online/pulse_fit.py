@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.circuit import AbstractCircuit, with_slopes
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_bands import Bands
 from etid.signals.harmonics import real_parts
@@ -44,11 +45,14 @@ class Expected(NamedTuple):
     Attributes:
         gain: G in each band.
         slope: Its derivatives with respect to the logarithms of the elements.
+        spread: Its derivative with respect to a spread of the time constants, ε in
+            `etid.estimators.score_tests.other_circuit`.
         aliased: Aliases, for a delay of 0.
     """
 
     gain: Complex[Array, "*lane band"]
     slope: Complex[Array, "*lane element band"]
+    spread: Complex[Array, "*lane band"]
     aliased: Complex[Array, "*lane band"]
 
 
@@ -116,12 +120,12 @@ class GainModel(eqx.Module):
         """The gain of a load, and its derivatives."""
         z, by_element = with_slopes(self.circuit, logs, self.bands.frequency)
         admittance = reciprocal(z + self.source)
-        slope = by_element * (self.source * admittance * admittance)[None, :]
-        above = self.circuit.with_log_values(logs).response(
-            self.bands.sample_rate - self.bands.frequency
-        )
+        by_z = self.source * admittance * admittance
+        circuit = self.circuit.with_log_values(logs)
+        _, spread = other_circuit.spread(circuit.impedance(), self.bands.frequency)
+        above = circuit.response(self.bands.sample_rate - self.bands.frequency)
         aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
-        return Expected(z * admittance, slope, aliased)
+        return Expected(z * admittance, by_element * by_z[None, :], spread * by_z, aliased)
 
     def departure(self, at: "Expected", delay: Float[Array, ""]) -> Complex[Array, " band"]:
         """Ĝ − G e^(−jωτ): aliases, and the effect of the curvature of G over a band."""

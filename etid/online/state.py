@@ -14,7 +14,7 @@ from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
 from etid.estimators.registry import register_description
 from etid.estimators.score_tests.other_circuit import MOVED
 from etid.estimators.unknowns import LoadUnknowns
-from etid.online.alarms import SEEN_GAIN
+from etid.online.alarms import SEEN
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
 from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, counted, first_verdict, verdict_names
@@ -48,9 +48,10 @@ register_description(
             "its residual does not exceed the noise (χ² per degree of freedom of at most "
             f"{MISFIT_CHI2:g} or of what noise exceeds once in ten million pulses, or an "
             f"unexplained part of at most {100 * MISFIT_RRSE:g} % of the signal)",
-            "a score test, summed over the pulses since the electrode began anew, finds no "
+            "score tests, summed over the pulses since the electrode began anew, find no "
             "difference between the gains of the two records that moves an element by "
-            f"{100 * MOVED:g} % (at most {SEEN_GAIN:g} standard deviations)",
+            f"{100 * MOVED:g} %, and no relaxation that is spread over time constants (at most "
+            f"{SEEN:g} standard deviations)",
             f"its trigger delay is at most {DELAYS[-1]:g} samples",
             "no change of the driver was seen since the calibrations",
             "every relative standard error is below 1",
@@ -78,7 +79,8 @@ class ElectrodeState(eqx.Module):
         shown: A number that two different windows never share, of the last two windows.
         confirmed: Largest amplitude of a pulse that fitted its prediction, since the last pulse
             that did not; 0 if there was none.
-        gain: Sums of the test of the gain since the electrode began anew, `GainScore.sums`.
+        scores: Sums of the tests of a gain and of a spread since the electrode began anew,
+            `etid.online.alarms.Scores.sums`.
         level: Effective value of the gain of the last pulse; 1 if the electrode is open.
         variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
         chi2: χ² of the last pulse.
@@ -100,7 +102,7 @@ class ElectrodeState(eqx.Module):
     offset: Float[Array, "*lane"]
     shown: Float[Array, "*lane 2"]
     confirmed: Float[Array, "*lane"]
-    gain: Float[Array, "*lane 3"]
+    scores: Float[Array, "*lane change 3"]
     level: Float[Array, "*lane"]
     variance: Float[Array, "*lane"]
     chi2: Float[Array, "*lane"]

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.estimators.starts import circuit_starts
 from etid.estimators.unknowns import LoadUnknowns
-from etid.online.alarms import GainScore, Innovation, averaged, driver_change
+from etid.online.alarms import Innovation, Scores, averaged, driver_change
 from etid.online.gain_bands import Bands
 from etid.online.projection import Seen
 from etid.online.pulse_fit import (
@@ -75,7 +75,7 @@ class Attempt(NamedTuple):
         chi2: χ² of the pulse.
         rrse: RRSE of the pulse.
         result: Verdict.
-        gain: Score of the gain.
+        scores: Scores of a gain and of a spread.
     """
 
     own: Float[Array, "*lane own"]
@@ -84,7 +84,7 @@ class Attempt(NamedTuple):
     chi2: Float[Array, "*lane"]
     rrse: Float[Array, "*lane"]
     result: RESULTS
-    gain: GainScore
+    scores: Scores
 
 
 class Suspicion(NamedTuple):
@@ -246,7 +246,7 @@ def attempt(
     by_delay = at.curvature[:-1, -1]
     told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
     inverse = inverse_of_few(at.curvature)
-    score = GainScore.of(pulse, measured.variance, expected, residual, inverse)
+    scores = Scores.of(pulse, measured.variance, expected, residual, inverse)
     late = jnp.abs(LoadUnknowns.of(own).delay_samples) > DELAYS[-1]
     result = first_verdict(
         (measured.bad != SUCCESSFUL, measured.bad),
@@ -254,7 +254,7 @@ def attempt(
         (~(decrement < SETTLED**2), MAX_STEPS_REACHED),
         (misses(chi2, rrse) & ~noisy | late, RESULTS.misfit),
     )
-    return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, score)
+    return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, scores)
 
 
 def _tracked(
@@ -364,10 +364,10 @@ def after_pulse(
     lost = running & ((missed >= PATIENCE) | (measured.bad == RESULTS.unconnected))
     restarted = good & again
     one = jnp.where(restarted, 1, state.pulses + 1)
-    gain = used.gain.sums + jnp.where(restarted, 0.0, state.gain)
-    gain = jnp.where(good, gain, state.gain)
-    wrong_gain = good & used.gain._replace(sums=gain).wrong()
-    fits = running & good & ~suspected.jump & ~wrong_gain
+    sums = used.scores.sums + jnp.where(restarted, 0.0, state.scores)
+    sums = jnp.where(good, sums, state.scores)
+    wrong = good & used.scores._replace(sums=sums).wrong()
+    fits = running & good & ~suspected.jump & ~wrong
     reached = jnp.maximum(state.confirmed, measured.amplitude)
     begun = ~running & (used.result == MAX_STEPS_REACHED)
     # An impedance is nearly linear in resistances and in 1/C, less so in their logarithms: what is
@@ -386,13 +386,13 @@ def after_pulse(
         offset=measured.offset,
         shown=jnp.stack([measured.shown, state.shown[0]]),
         confirmed=jnp.where(fits, reached, jnp.where(silent, state.confirmed, 0.0)),
-        gain=gain,
+        scores=sums,
         level=jnp.where(silent, state.level, measured.level),
         variance=jnp.where(silent, state.variance, measured.variance),
         chi2=jnp.where(silent, state.chi2, used.chi2),
         rrse=jnp.where(silent, state.rrse, used.rrse),
         result=RESULTS.where(
-            silent, state.result, RESULTS.where(wrong_gain, RESULTS.misfit, used.result)
+            silent, state.result, RESULTS.where(wrong, RESULTS.misfit, used.result)
         ),
         mean=jnp.where(followed, suspected.mean, jnp.where(good | lost, 0.0, state.mean)),
         mean_cov=jnp.where(

@@ -218,7 +218,7 @@ class Tracker(Overviewed):
             amplitude=jnp.zeros(lanes) if at_rest else nan,
             offset=nan,
             shown=jnp.full((lanes, 2), jnp.nan),
-            gain=jnp.zeros((lanes, 3)),
+            scores=jnp.zeros((lanes, 2, 3)),
             confirmed=jnp.zeros(lanes),
             level=nan,
             variance=nan,

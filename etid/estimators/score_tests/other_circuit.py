@@ -70,16 +70,23 @@ def changes(
     impedance: AbstractImpedance, frequency: Float[Array, " harmonic"]
 ) -> tuple[Complex[Array, " harmonic"], Complex[Array, "change harmonic"]]:
     """Z and ∂Z/∂ε [Ω] of all changes at real frequencies [Hz]; the first is the spread."""
+    z, by_spread = spread(impedance, frequency)
+    corner, level = relaxations(impedance, frequency[0], frequency[-1])
+    x = frequency_variable(frequency).imag[None, :] * (1 / corner)[:, None]
+    real = level[:, None] / (1 + x**2)
+    return z, jnp.concatenate([by_spread[None, :], jax.lax.complex(real, -x * real)])
+
+
+def spread(
+    impedance: AbstractImpedance, frequency: Float[Array, " harmonic"]
+) -> tuple[Complex[Array, " harmonic"], Complex[Array, " harmonic"]]:
+    """Z, and ∂Z/∂α, or ∂Z/∂ε of a circuit that has an α [Ω]."""
     s = frequency_variable(frequency)
     log_s = jax.lax.complex(jnp.log(s.imag), jnp.full_like(frequency, jnp.pi / 2))
     if impedance.exponents():
         log_s = log_s - as_complex((log_s.real[0] + log_s.real[-1]) / 2)
         log_s = log_s * log_s
-    z, spread = jax.jvp(impedance, (s,), (s * log_s,))
-    corner, level = relaxations(impedance, frequency[0], frequency[-1])
-    x = s.imag[None, :] * (1 / corner)[:, None]
-    real = level[:, None] / (1 + x**2)
-    return z, jnp.concatenate([spread[None, :], jax.lax.complex(real, -x * real)])
+    return jax.jvp(impedance, (s,), (s * log_s,))
 
 
 def relaxations(
