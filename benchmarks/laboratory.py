@@ -267,6 +267,11 @@ def leaky(load: Impedance, r: float) -> Impedance:
     return lambda f: load(f) * r / (load(f) + r)
 
 
+def inductive(load: Impedance, inductance: float) -> Impedance:
+    """A load with an inductor [H] in series."""
+    return lambda f: load(f) + 2j * np.pi * f * inductance
+
+
 @dataclasses.dataclass(frozen=True)
 class Nonlinear:
     """Terminal voltage with skin whose R_p falls with the voltage v across it.

@@ -9,7 +9,6 @@ is not true.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -18,7 +17,7 @@ import scipy.stats
 from benchmarks import perturbed_study as lab
 from benchmarks import visibility
 from benchmarks.failure_axes import Cole, TwoLayers
-from benchmarks.laboratory import hum, leaky, offset, pink, spike
+from benchmarks.laboratory import hum, inductive, leaky, offset, pink, spike
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import Change, all_records, both, calibrations, out, th, trials
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
@@ -163,6 +162,7 @@ SKINS: Mapping[str, Change] = {
     "cole_alpha0.8": lab.skin_is(functools.partial(Cole, alpha=0.8), words=True),
     "two_rc_mid": lab.skin_is(functools.partial(TwoLayers, share=0.3), words=True),
     "leak_100Rp": lab.skin_is(lambda skin: leaky(skin, 100 * skin.r_p)),
+    "inductance_5mH_skin": lab.skin_is(lambda skin: inductive(skin, 5e-3)),
 }
 
 _ALL_PARTS = ("r_protection", "r_secondary", "l_secondary", "l_magnetising", "r_source")
@@ -216,26 +216,28 @@ def change_of(name: str) -> Change:
 class Invisible:
     """Why a perturbation is not seen."""
 
-    # as many silent answers are excused as the best test of it would miss; all if there is no test
+    # as many silent answers are excused as the best test of it would miss
     change: visibility.Change | None = None
-    snr_db: float = math.inf  # largest at which it is so [dB]
+    # without a test: the relative error of an element that the perturbation itself makes
+    error: float = 0.0
 
-    def excuses(self, path: str, snr_db: float, silent: int, answers: int) -> bool:
-        """Whether the best test, too, would be silent so often, behind the skin of this path."""
+    def excuses(self, path: str, snr_db: float, silent: int, answers: int, beyond: float) -> bool:
+        """Whether so many answers behind the skin of this path would be silent for the best test.
+
+        `beyond` is the relative error of the worst of them that its standard error does not cover.
+        """
         if self.change is None:
-            return snr_db <= self.snr_db
+            return beyond <= self.error
         missed = visibility.missed(LOADS[path], snr_db, self.change)
         return bool(scipy.stats.binom.sf(silent - 1, answers, missed) > CHANCE)
 
 
 CHANCE = 0.01  # probability that the best test, too, is silent so often
 INVISIBLE: Mapping[str, Invisible] = {
-    # Every resistance and 1/C_p by 5 %: one calibration shows ratios to its resistor only.
-    "driver_Rload_wrong_5%": Invisible(),
-    # Up to 1.7 %: it has the impedance of another R_s + R_p ‖ C_p at every frequency.
-    "leak_100Rp": Invisible(),
-    # All: another driver with a resistor would give the same records.
-    "calibration_is_skin": Invisible(snr_db=40.0),
+    # Every resistance and 1/C_p: one calibration shows ratios to its resistor only.
+    "driver_Rload_wrong_5%": Invisible(error=0.05),
+    # It has the impedance of another R_s + R_p ‖ C_p at every frequency; R_p is least.
+    "leak_100Rp": Invisible(error=0.017),
     # R_p up to 13 %, and R_p of damp skin up to 6, 6 and 8 %.
     **{f"gain_out_{sign}1%_all": Invisible(visibility.gain(0.01, True)) for sign in "+-"},
     **{f"gain_out_{sign}1%_skin": Invisible(visibility.gain(0.01, False)) for sign in "+-"},
@@ -246,6 +248,7 @@ INVISIBLE: Mapping[str, Invisible] = {
     "lowpass_80kHz_skin": Invisible(visibility.lowpass(80e3)),
     "lowpass_80kHz_skin_one_period": Invisible(visibility.lowpass(80e3)),
     "capacitance_5pF_skin": Invisible(visibility.shunt(5e-12)),
+    "inductance_5mH_skin": Invisible(visibility.inductor(5e-3)),
     # R_p up to 4 %.
     "driver_Rprot_x1.05": Invisible(visibility.series(0.05 * TransformerDriver().r_protection)),
 }

@@ -13,7 +13,6 @@ import argparse
 import collections
 import functools
 import itertools
-import math
 import pathlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -152,7 +151,10 @@ def targets(answers: Sequence[Answer]) -> Iterator[Target]:
     for row in table(answers, ("perturbation", "snr_db", "path")):
         name, place, count = row["perturbation"], (row["path"], row["snr_db"]), row[silent]
         known = INVISIBLE.get(name)
-        if count and not (known and known.excuses(*place, count, row["answers"])):
+        if not count:
+            continue
+        beyond = abs(row["worst_error"]) * (1 - FAR / row["worst_stderrs"])
+        if not (known and known.excuses(*place, count, row["answers"], beyond)):
             where, text = f": {name}, {place[0]} at {place[1]:g} dB", f"{count} of {row['answers']}"
             yield Target.of(TARGETS, silent, count, after=where, text=text)
     for row in table(answers, ("perturbation",)):
@@ -172,10 +174,7 @@ def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
 
 def _label(name: str) -> str:
     """A perturbation, and what is said of one that nothing shows."""
-    if name not in INVISIBLE:
-        return name
-    snr = INVISIBLE[name].snr_db
-    return f"{name} (invisible{'' if math.isinf(snr) else f' up to {snr:g} dB'})"
+    return f"{name} (invisible)" if name in INVISIBLE else name
 
 
 def pairs(arguments: argparse.Namespace) -> bool:

@@ -48,6 +48,7 @@ TARGETS = {
     "right circuit where decisive, from 30 dB": at_least(0.99),
     "spurious element, from 20 dB": at_most(0.005),
     "coverage": COVERED,
+    "coverage of R_s, one truth at one SNR": at_least(0.75),  # 25 draws: 18 are one in 5000
     "silent over the failure map": at_most(2e-4),
     "right, not one RC, from 40 dB": at_least(0.95),
     "time, auto / plain fit, one RC": at_most(1.3),
@@ -78,6 +79,11 @@ def chosen(rows: Sequence[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[T
     for name, (of, quantities) in groups.items():
         covered = rate(*counts.covered(of, *quantities))
         yield Target.of(TARGETS, "coverage", covered, after=f", {name}")
+    for row in rows:
+        name, held = "coverage of R_s, one truth at one SNR", row["R_s_covered"]
+        target = Target.of(TARGETS, name, held, after=f": {row['truth']} at {row['snr_db']:g} dB")
+        if row["R_s_intervals"] and not target.met:
+            yield target
 
 
 def criteria(rows: Sequence[dict[str, Any]]) -> Iterator[Target]:

@@ -66,6 +66,14 @@ def series(r: float) -> Change:
     return lambda of: (-of.gains[0] * r / (of.skin + of.z_th), 0.0)
 
 
+def inductor(inductance: float) -> Change:
+    """An inductor in series with the load [H], with the skin only."""
+    return lambda of: (
+        of.gains[0] * 2j * np.pi * of.f * inductance * (1 - of.gains[0]) / of.skin,
+        0.0,
+    )
+
+
 def shunt(c: float) -> Change:
     """A capacitor across the load [F], with the skin only."""
     return lambda of: (

@@ -24,8 +24,8 @@ from benchmarks.perturbation_list import (
     pair,
 )
 from benchmarks.perturbed_study import undisturbed
-from benchmarks.rates import clopper_pearson, rate
-from benchmarks.runner import report
+from benchmarks.rates import COVERED, clopper_pearson, rate
+from benchmarks.runner import Target, report
 from etid.simulation.scenes import Scene, Trial
 
 FEW_RECORDINGS = 12
@@ -91,8 +91,8 @@ def test_wrong_is_silent_where_neither_verdict_nor_standard_error_tells(
     assert of.refused == np.isnan(of.error).all()
 
 
-def _seen(name, silent, of=10, **more):
-    wrong = answer(FAR, perturbation=name, **more)
+def _seen(name, silent, of=10, error=FAR, **more):
+    wrong = answer(error, perturbation=name, **more)
     return [wrong] * silent + [dataclasses.replace(wrong, verdict="misfit")] * (of - silent)
 
 
@@ -100,6 +100,7 @@ def _seen(name, silent, of=10, **more):
     ("answers", "met"),
     [
         (_seen("leak_100Rp", 10), True),  # nothing can show it
+        (_seen("leak_100Rp", 1, error=(0.5, 0, 0)), False),  # but it does not make so much
         (_seen("swapped", 1, 1), False),
         (_seen("gain_out_+1%_all", 1, 1, snr_db=40.0), True),
         (_seen("gain_out_+1%_all", 1, 1), False),
@@ -115,6 +116,22 @@ def _seen(name, silent, of=10, **more):
 )
 def test_silent_answers_are_excused_up_to_what_the_best_test_would_miss(answers, met):
     assert report(perturbations.targets(answers)) == met
+
+
+@pytest.mark.parametrize(
+    ("value", "interval", "said"),
+    [
+        (0.975, (0.96, 0.99), "missed within scatter"),
+        (0.92, (0.90, 0.94), "missed within scatter"),
+        (0.99, (0.98, 0.995), "missed"),
+        (0.97, (0.92, 0.99), ""),
+    ],
+)
+def test_a_target_whose_scatter_touches_its_limits_is_missed_all_the_same(value, interval, said):
+    target = Target.of({"coverage": COVERED}, "coverage", value, interval=interval)
+    assert target.met == (not said)
+    assert str(target).rpartition(", ")[2] == said or not said
+    assert report([target]) == target.met
 
 
 def test_the_readme_has_the_table_of_the_last_results():
