@@ -26,11 +26,12 @@ from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS, recorded
 from benchmarks.perturbation_list import AND, INVISIBLE, PERTURBATIONS, UNDISTURBED, change_of, pair
 from benchmarks.perturbed_study import PARTS, Truth, undisturbed
+from benchmarks.rates import rate
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, show, tabled
 
 TARGETS = {
     "silent": at_most(0),  # but for what no test can see
-    "undisturbed recordings refused": at_most(0.02),
+    "undisturbed recordings refused": at_most(1 / 2000),
     "silent pairs of faults that are seen alone": at_most(0),
 }
 KINDS = tuple(charts.ANSWERS)
@@ -157,10 +158,10 @@ def targets(answers: Sequence[Answer]) -> Iterator[Target]:
         if not (known and known.excuses(*place, count, row["answers"], beyond)):
             where, text = f": {name}, {place[0]} at {place[1]:g} dB", f"{count} of {row['answers']}"
             yield Target.of(TARGETS, silent, count, after=where, text=text)
-    for row in table(answers, ("perturbation",)):
-        if row["perturbation"] in UNDISTURBED:
-            share = (row["refused"] + row["said"]) / row["answers"]
-            yield Target.of(TARGETS, refused, share, after=f": {row['perturbation']}")
+    of = [answer for answer in answers if answer.perturbation in UNDISTURBED]
+    if of:
+        share = rate([kind(one) in {"refused", "said"} for one in of], [one.seed for one in of])
+        yield Target.of(TARGETS, refused, share)
 
 
 def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:

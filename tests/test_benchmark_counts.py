@@ -110,8 +110,8 @@ def _seen(name, silent, of=10, error=FAR, **more):
         (_seen("gain_out_+1%_all", 5, snr_db=40.0), False),
         (_seen("gain_out_+1%_skin", 9, snr_db=40.0, path="damp"), True),
         (_seen("gain_out_+1%_skin", 1, snr_db=40.0), False),
-        ([answer()] * 98 + [answer(verdict="misfit")] * 2, True),
-        ([answer()] * 97 + [answer(verdict="misfit")] * 3, False),
+        ([answer()] * 1999 + [answer(verdict="misfit")], True),
+        ([answer()] * 1998 + [answer(verdict="misfit")] * 2, False),
     ],
 )
 def test_silent_answers_are_excused_up_to_what_the_best_test_would_miss(answers, met):

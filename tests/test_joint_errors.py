@@ -6,7 +6,7 @@ import numpy as np
 
 from etid.estimators.joint import errors
 from etid.estimators.joint.terms import Loads
-from etid.estimators.sandwich import Curvature
+from etid.estimators.sandwich import Curvature, Linear
 from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
 
@@ -68,3 +68,19 @@ def test_the_covariance_of_the_driver_is_that_of_all_parameters_at_once():
     bread = jnp.linalg.inv(sum(of.expected for of in rests))
     found = bread @ (sum(of.score for of in rests) + more) @ bread
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_noise_of_an_unloaded_record_moves_the_gradient_as_the_gains_bring_it_into_the_terms():
+    """∂(J r)/∂n of terms Re and Im of g n, for real and for imaginary noise of each X."""
+    outputs, size, q = 2, 4, 3
+    draws = np.random.default_rng(2)
+    jacobian = draws.standard_normal((q, 2 * outputs * size))
+    gains = draws.standard_normal((outputs, size)) + 1j * draws.standard_normal((outputs, size))
+    expected = []
+    for unit in (1.0, 1j):
+        for x in range(size):
+            noise = np.where(np.arange(size) == x, unit * gains, 0.0)
+            expected.append(jacobian @ np.concatenate([noise.real.ravel(), noise.imag.ravel()]))
+    ones = jnp.ones(2 * outputs * size)
+    found = errors._by_noise(Linear(jnp.asarray(jacobian), ones, ones), jnp.asarray(gains))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)

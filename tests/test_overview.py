@@ -226,3 +226,9 @@ def test_what_jax_traces_or_maps_can_be_shown(make):
 )
 def test_the_prefix_of_a_unit_fits_the_value(value, error, unit, text):
     assert quantity(value, unit, error) == text
+
+
+def test_an_estimate_that_diverges_predicts_nothing():
+    diverged = dataclasses.replace(fit("nonphysical"), rrse=np.asarray(np.inf))
+    assert "no finite prediction" in str(diverged)
+    assert "inf" not in str(diverged).replace("finite", "")
