@@ -1,0 +1,29 @@
+"""The search for garbage, which waits while many objects are made that live on."""
+
+import gc
+
+from etid.garbage import MANY, unsearched
+
+
+def test_many_new_objects_are_not_searched_and_what_is_frozen_stays_frozen():
+    with unsearched():
+        kept = [[] for _ in range(2 * MANY)]
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    assert gc.get_count()[0] < MANY  # they count as old ones
+    gc.freeze()
+    try:
+        frozen = gc.get_freeze_count()
+        with unsearched():
+            kept += [[] for _ in range(2 * MANY)]
+        assert gc.get_freeze_count() == frozen
+    finally:
+        gc.unfreeze()
+
+
+def test_after_an_error_the_search_goes_on():
+    try:
+        with unsearched():
+            raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        assert gc.isenabled()
