@@ -224,7 +224,7 @@ class Invisible:
     def excuses(self, path: str, snr_db: float, silent: int, answers: int, beyond: float) -> bool:
         """Whether so many answers behind the skin of this path would be silent for the best test.
 
-        `beyond` is the relative error of the worst of them that its standard error does not cover.
+        `beyond` is the largest relative error of them beyond what a right answer may have.
         """
         if self.change is None:
             return beyond <= self.error

@@ -154,7 +154,7 @@ def targets(answers: Sequence[Answer]) -> Iterator[Target]:
         known = INVISIBLE.get(name)
         if not count:
             continue
-        beyond = abs(row["worst_error"]) * (1 - FAR / row["worst_stderrs"])
+        beyond = max(_beyond(of) for of in answers if _place(of) == (name, *place))
         if not (known and known.excuses(*place, count, row["answers"], beyond)):
             where, text = f": {name}, {place[0]} at {place[1]:g} dB", f"{count} of {row['answers']}"
             yield Target.of(TARGETS, silent, count, after=where, text=text)
@@ -162,6 +162,16 @@ def targets(answers: Sequence[Answer]) -> Iterator[Target]:
     if of:
         share = rate([kind(one) in {"refused", "said"} for one in of], [one.seed for one in of])
         yield Target.of(TARGETS, refused, share)
+
+
+def _place(of: Answer) -> tuple[Any, ...]:
+    return of.perturbation, of.path, of.snr_db
+
+
+def _beyond(of: Answer) -> float:
+    """Largest relative error of a successful answer beyond what a right one may have."""
+    allowed = np.minimum(FAR * of.stderr, estimators.OFF)
+    return float(np.nanmax(np.abs(of.error) - allowed)) if of.successful else 0.0
 
 
 def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
-from etid.estimators.score_tests.other_circuit import MOVED
+from etid.estimators.score_tests.other_circuit import MOVED, SPREAD
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online import alarms, tick
 from etid.online import state as states
-from etid.online.alarms import SEEN, SPREAD, Scores
+from etid.online.alarms import SEEN_IN_PULSES, PulseScores
 from etid.online.gain_bands import Bands
 from etid.online.projection import Seen
 from etid.online.pulse_fit import Expected, GainModel
@@ -75,7 +75,7 @@ CASES = [
 # NumPy's arrays stand in the place of JAX's.
 MEASURED: Any = Measured
 ATTEMPT: Any = Attempt
-SCORES: Any = Scores
+SCORES: Any = PulseScores
 SUSPICION: Any = Suspicion
 RESULT = {"good": GOOD, "bad": BAD, "late": LATE}
 
@@ -255,11 +255,11 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
     ]
     bad, delay, decrement, squares, verdict = map(np.array, zip(*rows, strict=True))
     weight, gain = np.array([3.0, 2.0, 0.0]), np.array([1 + 1j, 2j, 5.0])
-    nothing, zero = Scores(jnp.zeros((2, 3)), jnp.zeros(2)), jnp.asarray(0.0)
+    nothing, zero = PulseScores(jnp.zeros((2, 3)), jnp.zeros(2)), jnp.asarray(0.0)
     model = object.__new__(GainModel)  # only these two fields are read
     object.__setattr__(model, "bands", types.SimpleNamespace(weight=jnp.asarray(weight)))
     object.__setattr__(model, "noise_freedom", jnp.asarray(1000.0))
-    monkeypatch.setattr(Scores, "of", lambda *_: nothing)
+    monkeypatch.setattr(PulseScores, "of", lambda *_: nothing)
     monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
     monkeypatch.setattr("etid.online.tick.Pulse", lambda *_: None)
 
@@ -293,22 +293,22 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
 
 def test_a_gain_or_a_spread_is_wrong_if_all_noise_and_one_that_does_not_matter_are_less():
     """The variance is 16 by the pulses and 3² by the calibrations: a standard deviation of 5."""
-    limit = MOVED / (SEEN * 5) * 16
+    limit = MOVED / (SEEN_IN_PULSES * 5) * 16
     for score, moved, wrong in (
-        (SEEN * 5.01, [0.0, 9.0], True),
-        (-SEEN * 5.01, [-9.0, 0.0], True),
-        (SEEN * 4.99, [0.0, 9.0], False),
-        (SEEN * 10, [0.0, 1.01 * limit], True),
-        (SEEN * 10, [0.0, 0.99 * limit], False),
+        (SEEN_IN_PULSES * 5.01, [0.0, 9.0], True),
+        (-SEEN_IN_PULSES * 5.01, [-9.0, 0.0], True),
+        (SEEN_IN_PULSES * 4.99, [0.0, 9.0], False),
+        (SEEN_IN_PULSES * 10, [0.0, 1.01 * limit], True),
+        (SEEN_IN_PULSES * 10, [0.0, 0.99 * limit], False),
         (np.nan, [0.0, 9.0], False),
     ):
-        found = Scores(jnp.array([[score, 16.0, 3.0], [0.0, 1.0, 0.0]]), jnp.array(moved))
+        found = PulseScores(jnp.array([[score, 16.0, 3.0], [0.0, 1.0, 0.0]]), jnp.array(moved))
         assert bool(found.wrong()) == wrong
     information = 1e6
     for score, wrong in ((1.01, True), (-1.01, True), (0.99, False)):
-        score *= SEEN * np.sqrt(information) + SPREAD * information
+        score *= SEEN_IN_PULSES * np.sqrt(information) + SPREAD * information
         sums = jnp.array([[0.0, 1.0, 0.0], [score, information, 0.0]])
-        assert bool(Scores(sums, jnp.zeros(2)).wrong()) == wrong
+        assert bool(PulseScores(sums, jnp.zeros(2)).wrong()) == wrong
 
 
 # --- changes --------------------------------------------------------------------------------------
@@ -510,7 +510,7 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(monkeypatch):
     for name in ("departure", "undelayed", "expected"):
         monkeypatch.setattr(GainModel, name, lambda *_: wave)
     measured, model = MEASURED(wave, zero, jnp.ones(3), *[zero] * 6), object.__new__(GainModel)
-    scores = Scores(jnp.zeros((2, 3)), two)
+    scores = PulseScores(jnp.zeros((2, 3)), two)
 
     @jax.jit
     @jax.vmap

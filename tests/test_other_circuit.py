@@ -16,7 +16,7 @@ from benchmarks.perturbed_study import undisturbed
 from etid.circuits.circuit import Resistor
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import FALSE_ALARMS, SEEN, other_circuit
-from etid.estimators.score_tests.other_circuit import Scores
+from etid.estimators.score_tests.other_circuit import Score, Scores
 from etid.simulation.scenes import Trial
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
@@ -44,11 +44,23 @@ def test_the_slope_is_that_of_a_constant_phase_and_of_the_asymmetry_of_one():
 
 def test_a_relaxation_becomes_a_layer_of_diffusion():
     r_p, tau, f = 1e5, 90e-6, np.geomspace(60.0, 1e6, 30)
-    slowest = etid.ParallelRC(8 / np.pi**2 * r_p, tau / (2 * r_p))
-    change = other_circuit.layer(slowest.impedance(), jnp.asarray(f))
+    whole = 8 / np.pi**2 * (1 + np.sum(1 / other_circuit.FASTER**2))  # without still faster ones
+    one = etid.ParallelRC(whole * r_p, 4 / np.pi**2 * tau / (whole * r_p))
+    change = other_circuit.layer(one.impedance(), jnp.asarray(f))
     root = np.sqrt(2j * np.pi * f * tau)
-    left = np.asarray(slowest.response(f)) + np.asarray(change) - r_p * np.tanh(root) / root
-    assert np.max(np.abs(left)) < 0.04 * r_p  # still faster relaxations
+    left = np.asarray(one.response(f)) + np.asarray(change) - r_p * np.tanh(root) / root
+    assert whole > 0.96
+    assert np.max(np.abs(left)) < 1.01 * (1 - whole) * r_p
+
+
+def test_a_change_shows_unless_the_circuit_makes_it_or_an_element_would_be_negative():
+    """Z is linear in R, 1/C and, here, the logarithm of a third element."""
+    z, stderr = jnp.array([1.0, 1.0, 1.0, 1.0, jnp.nan, jnp.nan]), jnp.full(6, 0.1)
+    slope = [(-0.9, 0.9, -9.0), (-1.1, 0.0, 0.0), (0.0, 1.1, 0.0), (9.0, -9.0, 9.0)]
+    slope = jnp.array([*slope, (0.0, 0.0, 0.0), (-1.1, 0.0, 0.0)])
+    powers = jnp.array([1.0, -1.0, 0.0])
+    found = jax.vmap(lambda of: of.would_show(powers))(Score(z, z, z, stderr, slope))
+    np.testing.assert_allclose(found, [10.0, np.inf, np.inf, 10.0, 0.0, 0.0])
 
 
 def scores(residual, rows, jacobian):

@@ -171,7 +171,7 @@ def counted(tables):
         ({"deviance": 1030.0, "z": (0.0, 2.9, *[0.0] * 7)}, [0, 5, 3, 4]),
         ({"deviance": 1030.0, "z": (*[0.0] * 8, 9.0)}, [0]),  # a gain is no circuit
         ({"deviance": 1300.0, "name": "misfit"}, [0, 5, 3, 4]),  # all that are not simpler
-        ({"shows": 6.9}, [0, 5]),  # one with as many elements, which noise may hide
+        ({"shows": 5.9}, [0, 5]),  # one with as many elements, which noise may hide
         ({"shows": np.nan}, [0, 5]),
         ({"error": 0.2}, [0, 5, 2, 1]),  # and simpler ones if an element is hardly determined
     ],
@@ -306,7 +306,7 @@ def test_a_layer_of_diffusion_may_hide_behind_damp_skin_only(study, driver):
     """Even at 55 dB, where all elements of damp skin are known to 0.4 %, a layer was not seen."""
     supports = [etid.identify_skin(study[name], driver).support for name in ("dry", "damp")]
     dry, damp = (0.0 if one is None else float(one.layer_shows) for one in supports)
-    assert 0 < damp < SHOWS < dry
+    assert 0 < damp < SHOWS < dry < np.inf
 
 
 def test_a_spread_has_a_positive_score(study, driver):

@@ -26,6 +26,7 @@ from etid.signals.noise import Measurement, coloured, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
+LANES = 64  # lanes or circuits of one call; the last call is padded
 STEPS = 4  # lengths per octave; the padding is at most a fifth
 
 
@@ -42,7 +43,7 @@ class Lags(NamedTuple):
 
     @classmethod
     def of(cls, *late: float, left: float = LEFT) -> "Lags":
-        """Delays rounded to whole samples; 0 up to `left` and if they are not finite."""
+        """Delays rounded to whole samples; those of at most `left`, or not finite, become 0."""
         return cls(*(round(by) if left < abs(by) < math.inf else 0 for by in late))
 
 

@@ -24,7 +24,7 @@ from etid.recordings.untrusted import attribute, translated
 from etid.results.fit import Fit
 from etid.results.fits import DESCRIBED, SCHEMA, Fits
 from etid.results.fits_columns import long_form
-from etid.results.hdf5_table import REMEDY, Table, opened_table, same_length
+from etid.results.hdf5_table import REMEDY, Table, check_same_length, opened_table
 
 ROWS = 1 << 16  # fits in memory at a time
 QUALITY = ("rrse", "chi2", "steps", "remarks")
@@ -100,7 +100,7 @@ def _columns(table: Table, names: Sequence[str]) -> dict[str, h5py.Dataset]:
                "remarks": "text", "note": "text"}  # fmt: skip
     kinds = DESCRIBED | dict.fromkeys(elements, "number") | quality
     columns = {name: table.column(name, kind) for name, kind in kinds.items()}
-    same_length(table, columns)
+    check_same_length(table, columns)
     return columns
 
 

@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, with_slopes
+from etid.estimators.lanes import LANES
 from etid.estimators.score_tests import FALSE_ALARMS
 from etid.numpy_tier.tiers import program
 from etid.recordings.repeats import ALIGNED, Repeats
@@ -47,7 +48,6 @@ EXPLAINED = (
     "inconsistent",
     "biased",
 )  # verdicts that a change may cause
-LANES = 64  # lanes or circuits of one call; the last call is padded
 RIDGE = 1e-10  # added to the diagonal, for elements without effect
 LARGEST = 20.0  # limit on the change of a logarithm; an undetermined change can be arbitrary
 USUAL = 12.0  # χ² that exceeds its mean by no more is never unlikely

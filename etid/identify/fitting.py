@@ -24,6 +24,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import (
+    LANES,
     AbstractLane,
     Harmonics,
     Lags,
@@ -35,7 +36,6 @@ from etid.estimators.lanes import (
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.identify import changes
-from etid.identify.changes import LANES
 from etid.identify.second_minimum import ASIDE, likelier
 from etid.numpy_tier.tiers import program, worth_compiling
 from etid.recordings.causes import LOG, log_changes

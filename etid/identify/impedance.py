@@ -188,8 +188,9 @@ def _remarks(z: Complex[np.ndarray, " frequency"]) -> Remark:
 
 def _support(deviance: Float[Array, ""], values: int, elements: int) -> Support:
     """The likelihood of a fit; no changes of the circuit are tested."""
-    nothing, terms = jnp.zeros(()), jnp.asarray(2.0 * values)
-    return Support(deviance, terms, jnp.zeros(CHANGES), nothing, jnp.zeros(elements), nothing)
+    terms, untested = jnp.asarray(2.0 * values), jnp.asarray(jnp.nan)
+    nothing = jnp.zeros(CHANGES), jnp.zeros(()), jnp.zeros(elements)
+    return Support(deviance, terms, *nothing, untested)
 
 
 @in_float64

@@ -52,7 +52,7 @@ has at most the distribution χ² with one degree of freedom. A gain g₀ that m
 `MOVED` does not matter (`etid.estimators.score_tests.other_circuit`), and instruments have smaller
 ones, which many pulses show. So a gain is wrong if it exceeds this one:
 
-    |Σs| − g₀ ΣI  >  SEEN √(ΣI + (Σc)²).
+    |Σs| − g₀ ΣI  >  SEEN_IN_PULSES √(ΣI + (Σc)²).
 
 As in a fit of a whole record, the verdict is then `misfit`.
 
@@ -78,7 +78,7 @@ FALSE_ALARMS = 0.05  # per electrode and hour, expected if T and Q have exactly 
 WEIGHT = 0.1  # λ, of the newest innovation in the moving mean
 DRIVER = 9.0  # standard deviations; no false alarm is expected in a year
 COMMON = 8  # electrodes that are needed to tell the driver from the skin
-SEEN = 5.3  # standard deviations that noise exceeds once in 10⁷ pulses
+SEEN_IN_PULSES = 5.3  # standard deviations that noise exceeds once in 10⁷ pulses
 
 
 def limit(elements: int, pulse_rate: float) -> float:
@@ -168,8 +168,8 @@ def driver_change(
     return enough & (moved | (jnp.sum(jumped & counts, dtype=float) > number / 2))
 
 
-class Scores(NamedTuple):
-    """Scores of a gain and of a spread of one pulse, and sums of several.
+class PulseScores(NamedTuple):
+    """PulseScores of a gain and of a spread of one pulse, and sums of several.
 
     Attributes:
         sums: s, I and c of each.
@@ -187,7 +187,7 @@ class Scores(NamedTuple):
         expected: Expected,
         residual: Float[Array, " part"],
         inverse: Float[Array, "own own"],
-    ) -> "Scores":
+    ) -> "PulseScores":
         """The scores of a pulse.
 
         Args:
@@ -226,4 +226,4 @@ class Scores(NamedTuple):
         score, information, common = self.sums.T
         scatter = jnp.sqrt(information + common**2)
         allowed = jnp.stack([MOVED / jnp.max(jnp.abs(self.moved)), jnp.asarray(SPREAD)])
-        return jnp.any(jnp.abs(score) - SEEN * scatter > allowed * information)
+        return jnp.any(jnp.abs(score) - SEEN_IN_PULSES * scatter > allowed * information)

@@ -12,9 +12,9 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import Description
 from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
 from etid.estimators.registry import register_description
-from etid.estimators.score_tests.other_circuit import MOVED
+from etid.estimators.score_tests.other_circuit import MOVED, SPREAD
 from etid.estimators.unknowns import LoadUnknowns
-from etid.online.alarms import SEEN
+from etid.online.alarms import SEEN_IN_PULSES
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
 from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, counted, first_verdict, verdict_names
@@ -50,8 +50,8 @@ register_description(
             f"unexplained part of at most {100 * MISFIT_RRSE:g} % of the signal)",
             "score tests, summed over the pulses since the electrode began anew, find no "
             "difference between the gains of the two records that moves an element by "
-            f"{100 * MOVED:g} %, and no relaxation that is spread over time constants (at most "
-            f"{SEEN:g} standard deviations)",
+            f"{100 * MOVED:g} %, and no spread of time constants above {SPREAD:g} (at most "
+            f"{SEEN_IN_PULSES:g} standard deviations)",
             f"its trigger delay is at most {DELAYS[-1]:g} samples",
             "no change of the driver was seen since the calibrations",
             "every relative standard error is below 1",
@@ -80,7 +80,7 @@ class ElectrodeState(eqx.Module):
         confirmed: Largest amplitude of a pulse that fitted its prediction, since the last pulse
             that did not; 0 if there was none.
         scores: Sums of the tests of a gain and of a spread since the electrode began anew,
-            `etid.online.alarms.Scores.sums`.
+            `etid.online.alarms.PulseScores.sums`.
         level: Effective value of the gain of the last pulse; 1 if the electrode is open.
         variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
         chi2: χ² of the last pulse.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.estimators.starts import circuit_starts
 from etid.estimators.unknowns import LoadUnknowns
-from etid.online.alarms import Innovation, Scores, averaged, driver_change
+from etid.online.alarms import Innovation, PulseScores, averaged, driver_change
 from etid.online.gain_bands import Bands
 from etid.online.projection import Seen
 from etid.online.pulse_fit import (
@@ -75,7 +75,7 @@ class Attempt(NamedTuple):
         chi2: χ² of the pulse.
         rrse: RRSE of the pulse.
         result: Verdict.
-        scores: Scores of a gain and of a spread.
+        scores: PulseScores of a gain and of a spread.
     """
 
     own: Float[Array, "*lane own"]
@@ -84,7 +84,7 @@ class Attempt(NamedTuple):
     chi2: Float[Array, "*lane"]
     rrse: Float[Array, "*lane"]
     result: RESULTS
-    scores: Scores
+    scores: PulseScores
 
 
 class Suspicion(NamedTuple):
@@ -246,7 +246,7 @@ def attempt(
     by_delay = at.curvature[:-1, -1]
     told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
     inverse = inverse_of_few(at.curvature)
-    scores = Scores.of(pulse, measured.variance, expected, residual, inverse)
+    scores = PulseScores.of(pulse, measured.variance, expected, residual, inverse)
     late = jnp.abs(LoadUnknowns.of(own).delay_samples) > DELAYS[-1]
     result = first_verdict(
         (measured.bad != SUCCESSFUL, measured.bad),

@@ -112,7 +112,7 @@ def _facts(
 
 
 def _instrument(found: StudyFits) -> str:
-    """What is stated of the instrument: in the settings, as in former files, and by the drivers."""
+    """What is stated of the instrument: in the settings and by the drivers."""
     drivers = [one for one in found.drivers.values() if isinstance(one, ContinuousDriver)]
     told = [() if found.settings is None else found.settings.instrument]
     told += [one.instrument.listed() for one in drivers if one.instrument is not None]
@@ -137,7 +137,7 @@ def _table(found: StudyFits, settings: Settings) -> Table:
     """The settings of the run as a table."""
     source = "in memory"
     if settings.source:
-        source = f"file {settings.source}, SHA-256 {settings.source_sha256 or 'not known'}"
+        source = f"file {settings.source}, SHA-256 {settings.source_sha256}"
     driver = f"of {settings.driver}, " if settings.driver else ""
     circuit = type(found.fits.circuit).__name__
     if settings.candidates:

@@ -75,7 +75,8 @@ class Support(eqx.Module):
             can make it itself.
         spread_slope: Change of the logarithm of each element for each unit of this size.
         layer_shows: How much the data would show that the load is a layer through which charge
-            diffuses, in place of the circuit [standard deviations]; 0 if this is not tested.
+            diffuses, in place of the circuit [standard deviations]; infinite if an element would be
+            negative, 0 if the circuit can be this layer, NaN if this is not tested.
     """
 
     deviance: Float[Array | np.ndarray, "*lane"]

@@ -13,7 +13,7 @@ from etid.recordings.fields import DESCRIBING
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of
 from etid.results.fit import Limited
-from etid.results.hdf5_table import Table, same_length
+from etid.results.hdf5_table import Table, check_same_length
 from etid.results.verdicts import RESULTS, verdicts_of
 
 SCHEMA = "etid/fits"
@@ -80,7 +80,7 @@ def columns_of(
     columns["change_stderr"] = table.column("change_stderr", "number", (size + 1,))
     if "outside" in table:  # only for fits with bounds
         columns |= {name: table.column(name, "number", (size,)) for name in LIMITS}
-    same_length(table, columns)
+    check_same_length(table, columns)
     read = {name: table.read(column) for name, column in columns.items()}
     numbers = (*single, "cov", "shared_cov", "change_stderr")
     real = {name: read[name].astype(float) for name in numbers}

@@ -184,12 +184,8 @@ def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[Table]:
         yield table
 
 
-def same_length(table: Table, columns: Mapping[str, np.ndarray | h5py.Dataset]) -> int:
-    """Number of rows of these columns.
-
-    Raises:
-        RecordingError: The numbers of rows differ.
-    """
+def check_same_length(table: Table, columns: Mapping[str, np.ndarray | h5py.Dataset]) -> None:
+    """Raise RecordingError unless these columns have the same number of rows."""
     sizes = {name: column.shape[0] for name, column in columns.items()}
     first = next(iter(sizes.values()), 0)
     for name, size in sizes.items():
@@ -200,4 +196,3 @@ def same_length(table: Table, columns: Mapping[str, np.ndarray | h5py.Dataset]) 
                 field=name,
                 remedy=REMEDY,
             )
-    return first

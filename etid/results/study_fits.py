@@ -84,9 +84,9 @@ class Settings:
     precision: str
     backend: str
     versions: tuple[str, ...]
-    plausible: tuple[float, ...] = PLAUSIBLE
-    instrument: tuple[str, ...] = ()
-    source_sha256: str = ""
+    plausible: tuple[float, ...]
+    instrument: tuple[str, ...]
+    source_sha256: str
     driver: str = ""
 
 

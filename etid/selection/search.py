@@ -45,7 +45,7 @@ ASKS = 2.8
 DOUBTFUL = 1 / 7
 # Standard deviations that a layer of diffusion would show, from which on it cannot hide: the
 # evidence for or against it is their square, and `ASKS` of them ask for it.
-SHOWS = 7.0
+SHOWS = 6.0
 PATIENCE = 60.0  # [s] for each recording, after which no further candidate is fitted
 FitRows = Callable[[int, Sequence[int]], Sequence[Fit]]
 

@@ -143,7 +143,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
             terms,
             other.relevant(),
             *other.spread.possible(),
-            of_layer.would_show(),
+            of_layer.would_show(load.gains.circuit.scaling()[0]),
         ),
     )
     wrong = other.seen() | other.has_other_gain() | falling.seen()

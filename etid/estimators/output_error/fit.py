@@ -335,7 +335,7 @@ def _support(objective: Float[Array, ""], records: Records, elements: int) -> Su
         jnp.zeros(CHANGES),
         nothing,
         jnp.zeros(elements),
-        nothing,
+        jnp.asarray(jnp.nan),
     )
 
 

@@ -58,11 +58,8 @@ NO_OTHER_GAIN = (
 SCALE = 1e-3
 GRID = 7  # time constants, two per decade; a relaxation is wider than that
 BEYOND = 2.0  # factor by which they exceed the band
-# Faster relaxations of a layer of diffusion, by √(τ₁/τ). The rest adds 4 % of R_p to R_s.
+# Faster relaxations of a layer of diffusion, by √(τ₁/τ). The rest adds 3 % of R_p to R_s.
 FASTER = np.arange(3.0, 17.0, 2.0)
-# Relative change of an element that a layer needs, from which on the element would be negative; it
-# is -1 to first order in ε.
-NEGATIVE = -1.25
 NOTHING = 1e-9  # of the power of a change; rounding leaves less of one that the circuit can make
 
 
@@ -103,12 +100,13 @@ def layer(
     """∂Z/∂ε [Ω] that turns, at ε = 1, each relaxation into a layer through which charge diffuses.
 
     Such a layer, tanh √(sτ) / √(sτ), is a slow relaxation, a ninth of it that is nine times as
-    fast, a 25th of it that is 25 times as fast, and so on:
+    fast, a 25th of it that is 25 times as fast, and so on. With Z(0) as it is,
 
-        ∂Z/∂ε = Σ Z(s/n²) / n²,      n = 3, 5, 7, …
+        ∂Z/∂ε = Σ (Z(s/n²) − Z(s)) / n² / (1 + Σ 1/n²),      n = 3, 5, 7, …
     """
     s, shares = frequency_variable(frequency), jnp.asarray(FASTER**-2)
-    return combined(shares, impedance(as_complex(shares)[:, None] * s[None, :]))
+    faster = impedance(as_complex(shares)[:, None] * s[None, :]) - impedance(s)[None, :]
+    return combined(shares / (1 + shares.sum()), faster)
 
 
 class Score(NamedTuple):
@@ -142,10 +140,17 @@ class Score(NamedTuple):
         stderr = jnp.where(tested, self.stderr, 0.0)
         return stderr, jnp.where(tested[..., None], self.slope, 0.0)
 
-    def would_show(self) -> Float[Array, "*change"]:
-        """Standard deviations of a change of ε = 1; infinite if an element would be negative."""
-        deviations = jnp.where(jnp.isfinite(self.z), 1 / self.stderr, 0.0)
-        return jnp.where(jnp.min(self.slope, axis=-1) < NEGATIVE, jnp.inf, deviations)
+    def would_show(self, powers: Float[Array, " element"]) -> Float[Array, ""]:
+        """Standard deviations of one change with ε = 1, if no element would be negative then.
+
+        Z is linear in R and in 1/C, whose logarithms are those of the elements times `powers`.
+
+        Returns:
+            Infinity if R or 1/C would be negative; 0 if the circuit can make the change itself.
+        """
+        negative = jnp.min(self.slope * powers) < -1
+        deviations = jnp.where(negative, jnp.inf, 1 / self.stderr)
+        return jnp.where(jnp.isfinite(self.z), deviations, 0.0)
 
     def contradicts(self) -> Bool[Array, "*change"]:
         """Whether the scale of a measured current is wrong; all changes must be such scales."""

@@ -171,7 +171,7 @@ def terminal_voltage(
     return lfilter(forward, safe, v_th)[0], stable
 
 
-def _finite(error: Float[Array, ""], stable: Bool[Array, ""]) -> Float[Array, ""]:
+def _or_infinite(error: Float[Array, ""], stable: Bool[Array, ""]) -> Float[Array, ""]:
     """The error; infinite if it is not finite or the loop is unstable."""
     return jnp.where(stable & jnp.isfinite(error), error, jnp.inf)
 
@@ -194,7 +194,7 @@ def driver_filter(
         ) -> Float[Array, ""]:
             load = Rational(r[None], jnp.ones(1, r.dtype))
             predicted, stable = terminal_voltage(candidate, load, v_th)
-            return _finite(rrse(predicted, v_out), stable)
+            return _or_infinite(rrse(predicted, v_out), stable)
 
         return jax.vmap(one)(v_th, v_out, r_load).max()
 
@@ -232,7 +232,7 @@ def periodic_driver_filter(
         predicted = forward * reciprocal(forward + num) * x
         closed = [add_polynomials(of * candidate.den, candidate.num) for of in r_load]
         stable = jnp.stack([is_stable(one) for one in closed]).all()
-        return _finite(jax.vmap(complex_rrse)(predicted, y).max(), stable)
+        return _or_infinite(jax.vmap(complex_rrse)(predicted, y).max(), stable)
 
     return iterate(solve, order - 1, order, assess)
 
@@ -247,7 +247,7 @@ def skin_filter(
 
     def assess(candidate: Rational) -> Float[Array, ""]:
         predicted, stable = terminal_voltage(z_th, candidate, v_th)
-        return _finite(rrse(predicted, v_out), stable)
+        return _or_infinite(rrse(predicted, v_out), stable)
 
     w = lfilter(z_th.num, z_th.den, v_out)[0]
     return iterate(in_time((v_th - v_out)[None], w[None], 1, 1), 1, 1, assess, iterations)
