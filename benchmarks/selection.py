@@ -81,11 +81,11 @@ def chosen(rows: Sequence[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[T
         covered = rate(*counts.covered(of, *quantities))
         yield Target.of(TARGETS, "coverage", covered, after=f", {name}")
     for row in rows:
-        name, count, held = "coverage of R_s, one truth at one SNR", row["R_s_intervals"], np.nan
+        count, held = row["R_s_intervals"], row["R_s_covered"]
         if count >= FEWEST:
-            held = row["R_s_covered"]
             where = f": {row['truth']} at {row['snr_db']:g} dB"
             ends = clopper_pearson(held * count, count)
+            name = "coverage of R_s, one truth at one SNR"
             target = Target.of(TARGETS, name, held, after=where, interval=ends)
             if not target.met:
                 yield target
