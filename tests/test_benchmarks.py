@@ -58,7 +58,7 @@ CASES = {
     ),
     "perturbations": (
         "--quick --snr-db 60 --folder {}", "perturbations.csv perturbations.svg",
-        "undisturbed recordings refused: base                       0 ",
+        "undisturbed recordings refused    ",
     ),
     "referee": ("", "", "not installed"),
     "rivals": ("scipy_harmonics --draws 1", "", "not installed"),
