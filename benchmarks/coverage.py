@@ -13,6 +13,7 @@ is of all elements of a load: a single one scatters by 1.5 % with 200 draws.
 import argparse
 import dataclasses
 import json
+import pathlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -42,15 +43,16 @@ HEADS = (
 MORE = "more"  # trials that take part in a joint fit, but share its errors and are not counted
 
 OPTIONS = (
-    option("--snr-db", default=60.0),
+    option("--snr-db", default=(60.0,)),
     option("--repetitions", default=200),
     option("--jitter", default=50e-9, help="rms trigger delay [s]"),
     option("--resistors", type=float, nargs="+", help="of the calibrations [ohm]"),
     option("--current-snr-db", type=float, help="identify from a measured current with this noise"),
-    option("--method", nargs="+", choices=ESTIMATORS, help="default: that of the records"),
+    option("--method", default=(DEFAULT,), choices=(DEFAULT, *ESTIMATORS)),
     option("--more", default=0, help="further trials, for a joint fit"),
     option("--parts", default=0.0, help="draw the parts of the driver with this spread"),
     option("--spice", metavar="SCENE", help="draw this SPICE recording afresh"),
+    option("-o", "--output", type=pathlib.Path, help="CSV to write"),
     DATA,
 )
 
@@ -217,21 +219,29 @@ def main(arguments: argparse.Namespace) -> bool:
     if arguments.spice is not None:
         truth = json.loads((arguments.data / FOLDER / "truth.json").read_text())
         drawn = scene_of(truth["scenes"][arguments.spice])
-        drawn = dataclasses.replace(drawn, trials=drawn.trials[:1])
+        scenes = {arguments.spice: dataclasses.replace(drawn, trials=drawn.trials[:1])}
     else:
-        drawn = scene(
-            arguments.snr_db,
-            10_000,
-            arguments.resistors or ([REFERENCE] if arguments.current_snr_db is None else []),
-            arguments.jitter,
-            more=arguments.more,
-            current_snr_db=arguments.current_snr_db,
-        )
-    bounds, drivers, asked = etid.bound(drawn), Drivers(), list[Target]()
+        current = arguments.current_snr_db
+        resistors = arguments.resistors or ([REFERENCE] if current is None else [])
+        scenes = {
+            f"{snr_db:g} dB": scene(
+                snr_db,
+                10_000,
+                resistors,
+                arguments.jitter,
+                more=arguments.more,
+                current_snr_db=current,
+            )
+            for snr_db in arguments.snr_db
+        }
+    asked = list[Target]()
     print(HEADS)
-    for method in arguments.method or [None]:
-        found = monte_carlo(drawn, arguments.repetitions, method, arguments.parts, drivers)
-        for name, of in found.items():
-            print("\n".join(lines(name, of, bounds[name].relative)))
-            asked += targets(f"{name}, {method or DEFAULT}", of)
-    return report(asked)
+    for of_scene, drawn in scenes.items():
+        bounds, drivers = etid.bound(drawn), Drivers()
+        for method in arguments.method:
+            by = None if method == DEFAULT else method
+            found = monte_carlo(drawn, arguments.repetitions, by, arguments.parts, drivers)
+            for name, of in found.items():
+                print("\n".join(lines(name, of, bounds[name].relative)))
+                asked += targets(f"{of_scene}, {name}, {method}", of)
+    return report(asked, arguments.output)

@@ -13,6 +13,7 @@ invisible, and a drift, which is not one error.
 
 import argparse
 import dataclasses
+import pathlib
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -53,6 +54,7 @@ OPTIONS = (
     option("--only", nargs="+", choices=KINDS, help="kinds of errors"),
     option("--mode", nargs="+", choices=MODES, default=MODES),
     option("--fault", type=float, help="one error of so many tolerances"),
+    option("-o", "--output", type=pathlib.Path, help="CSV to write"),
 )
 
 
@@ -143,4 +145,4 @@ def main(arguments: argparse.Namespace) -> bool:
                     change, delay = SEEN_BY_BEST[kind], SIZES["delay"]
                     best = visibility.found(LOADS[path], snr_db, change, fault, delay)
                     asked.append(found(name, of, best))
-    return report(asked)
+    return report(asked, arguments.output)
