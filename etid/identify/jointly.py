@@ -81,7 +81,7 @@ register_description(
         "joint maximum likelihood",
         "each driver and all recordings made with it were estimated in one fit by",
         "Z_th is common to all, each record has its own trigger delay τ. Where the delays scatter "
-        "by less than their errors, the upper limit of their scatter (95 %) is the standard "
+        "by less than their errors, the upper limit of their scatter (99.99 %) is the standard "
         "deviation of their prior. Where the current was measured beside V_th, I = X / (Z_L + "
         "Z_th), with a delay of its own, was the second equation for each harmonic. A load with a "
         "measured current alone needs no Z_th and was estimated alone.",

@@ -7,8 +7,9 @@ from N(0, w²), and the estimates t̂ have the covariance V of their fit. Then
     S(w) = t̂ᵀ (V + w² I)⁻¹ t̂
 
 is χ² with one degree of freedom for each record. The upper limit of w is where S(w) is as small as
-by chance in one of 20 studies. As the width of the prior of every delay it keeps the intervals
-honest, however far the true delays scatter.
+by chance in one of 10 000 studies. As the width of the prior of every delay it keeps the intervals
+honest, however far the true delays scatter. A few delays may be alike by chance: where the limit is
+too small, the elements are several standard errors off.
 """
 
 import math
@@ -17,7 +18,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-CHANCE = 0.05
+CHANCE = 1e-4  # part of the studies whose limit is too small
 STEPS = 40  # halvings of the logarithm of the width
 RANGE = 1e-6  # smallest width, relative to the largest one
 
