@@ -81,6 +81,7 @@ def of_fit(fit: Fit, freedom: int = TERMS) -> dict[str, Number]:
             "spread_slope": Number(
                 fit.support.spread_slope, 4 * ERRORS * of_each, 4 * ERRORS * of_each
             ),
+            "layer_shows": Number(fit.support.layer_shows, 4 * ERRORS * wide),
         }
     return found
 
@@ -143,9 +144,10 @@ def _same(before: Any, now: Number) -> bool:
         return False
     if value.dtype.kind != "f":
         return bool((was == value).all())
-    missing = np.isnan(was)
-    allowed = np.where(missing, 0.0, now.relative * np.abs(was) + now.absolute)
+    finite = np.isfinite(was)
+    number = np.where(finite, was, 0.0)
+    allowed = np.where(finite, now.relative * np.abs(number) + now.absolute, 0.0)
     assert np.isfinite(allowed).all(), f"tolerances that are no numbers: {now}"
     # Where the tolerance is smaller, the digits of the file count.
-    near = np.abs(value - was) <= np.maximum(allowed, WRITTEN * np.abs(was))
-    return bool((near | (value == was) | (missing & np.isnan(value))).all())
+    near = np.abs(value - number) <= np.maximum(allowed, WRITTEN * np.abs(number))
+    return bool(((finite & near) | (value == was) | (np.isnan(was) & np.isnan(value))).all())

@@ -8,6 +8,8 @@ import pytest
 
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
+from benchmarks.perturbation_list import PERTURBATIONS
+from benchmarks.perturbed_study import undisturbed
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.disturbances import joint
@@ -148,3 +150,18 @@ def test_two_periods_of_little_noise_are_fitted_where_aliases_are_small(load):
     fits = etid.identify_skins([trial(scene, seed) for seed in range(4)], three)
     assert set(fits.verdicts) == {"successful"}
     assert np.abs(off(fits, LOADS[load])).max() < 5.0  # a bias of two, and noise
+
+
+@pytest.mark.slow
+def test_a_slow_tail_after_each_pulse_is_refused_or_does_not_matter_at_60_db():
+    """5 mV and 5 ms in the skin's record only; from 70 dB on R_p is up to nine errors off."""
+    for number in range(6):
+        study = PERTURBATIONS["tail_5mV_5ms_skin"](undisturbed(number, 60.0))
+        driver = etid.identify_driver([of.recording(number) for of in study.calibrations])
+        fits = etid.identify_skins([of.recording(1000 + number) for of in study.trials], driver)
+        truth = np.array([study.truths[of.path].low for of in study.trials])
+        good = fits.verdicts == "successful"
+        assert good.any()
+        # R_p of dry skin has a bias of two standard errors; noise adds more than three to one of
+        # 700 such fits.
+        assert (np.abs(off(fits, truth))[good] < 5).all()

@@ -125,13 +125,17 @@ def test_of_several_reasons_one_is_the_verdict(chi2, driver, later, expected):
     assert unless(fit, jnp.asarray(later), RESULTS.biased).verdict == expected
 
 
-def test_hum_and_a_falling_or_late_resistance_are_remarks():
-    names = Remark.mains_hum, Remark.falls_with_current, Remark.follows_late
-    for seen in itertools.product([True, False], repeat=3):
-        expected = sum(name for name, one in zip(names, seen, strict=True) if one)
-        hum, falls, late = map(jnp.asarray, seen)
-        assert int(remarks(hum, falls, late)) == expected
-        of = estimate(hum=hum, falls=falls, late=late)
+def test_what_an_estimate_shows_beside_its_elements_are_remarks():
+    names = {
+        "hum": Remark.mains_hum,
+        "falls": Remark.falls_with_current,
+        "late": Remark.follows_late,
+        "doubtful": Remark.gain_doubtful,
+    }
+    for seen in itertools.product([True, False], repeat=len(names)):
+        of = estimate(**dict(zip(names, map(jnp.asarray, seen), strict=True)))
+        expected = sum(name for name, one in zip(names.values(), seen, strict=True) if one)
+        assert int(remarks(of)) == expected
         assert int(judged(of, etid.SkinRC(), SUCCESSFUL, "a method").remarks) == expected
 
 

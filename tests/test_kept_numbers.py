@@ -28,6 +28,7 @@ def test_a_tolerance_that_is_not_a_number_is_an_error(kept):
     with pytest.raises(AssertionError, match="tolerances that are no numbers"):
         kept([1.0, 2.0], [1.0, 2.0], relative=errors)
     kept([1.0, np.nan], [1.05, np.nan], absolute=errors)  # no number, so none is compared
+    kept([1.0, np.inf], [1.01, np.inf], relative=0.02)  # infinite is a value, not a tolerance
 
 
 @pytest.mark.parametrize(
@@ -37,6 +38,12 @@ def test_a_tolerance_that_is_not_a_number_is_an_error(kept):
         (1.0, 1.011, 0.0, 0.01),
         (1.0, np.nan, 0.01, 0.01),
         (np.nan, 1.0, 0.01, 0.01),
+        (1.0, np.inf, 0.01, 0.01),
+        (np.inf, 1.0, 0.01, 0.01),
+        (np.inf, 0.0, 0.01, 0.01),
+        (np.nan, 0.0, 0.01, 0.01),
+        (np.inf, -np.inf, 0.01, 0.01),
+        (np.inf, np.nan, 0.01, 0.01),
         (0.0, 1e-300, 0.01, 0.0),
         (1.0, 1.0 + 2e-8, 0.0, 0.0),
         ([1.0, 2.0], [1.0, 2.0, 3.0], 0.01, 0.0),

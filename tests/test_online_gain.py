@@ -3,20 +3,28 @@
 import dataclasses
 import functools
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.online_alarms import LOADS, Fingertip
+from etid.estimators.judgement import MISFIT_CHI2
+from etid.estimators.score_tests.other_circuit import SPREAD
+from etid.online.alarms import SEEN_IN_PULSES
+from etid.online.pulse_fit import GainModel
 from etid.online.tracker import Tracker
 from etid.results.verdicts import verdict_names
 from etid.simulation.scenes import Trial
+from tests.skins import off
 from tests.test_online import LOADS as SKINS
 from tests.test_online import (
     NOISE,
     TEN,
+    TRUTH,
     after_amplitude,
     calibrated,
     followed,
@@ -104,11 +112,21 @@ def test_a_gain_that_does_not_matter_is_never_refused():
     score, information, common = np.asarray(state.electrodes.scores)[:, 0].T
     assert (score**2 > 25 * (information + common**2)).any()
     assert set(found.ravel()) == {"successful"}
+    # Of its other errors R_p would be 50 off.
+    values = np.asarray(tracker.read(state).circuit.values())
+    truth = np.tile([dataclasses.astuple(skin) for skin in SKINS.values()], (TEN // 2, 1))
+    assert (np.abs(values - truth) < 5 * np.asarray(tracker.read(state).stderr.values())).all()
 
 
-def of_gain(tracker, pulses):
-    """Sums of the test after some pulses: s, I and c of each electrode."""
-    return np.asarray(followed(tracker, pulses).electrodes.scores)[:, 0].T
+GAIN, A_SPREAD = range(2)  # rows of the scores
+
+
+def of_row(row, tracker, pulses):
+    """Sums of one test after some pulses: s, I and c of each electrode."""
+    return np.asarray(followed(tracker, pulses).electrodes.scores)[:, row].T
+
+
+of_gain = functools.partial(of_row, GAIN)
 
 
 def test_the_score_is_that_of_the_gain_and_its_error_that_of_the_driver():
@@ -136,17 +154,97 @@ def test_the_score_is_that_of_the_gain_and_its_error_that_of_the_driver():
     assert (score**2 < 16 * (information + common**2)).all()
 
 
+def pulses_of(make):
+    """Six pulses of other skins at ten electrodes, dry and damp in turn, without noise."""
+    trials = tuple(Trial(name, make(skin)) for name, skin in SKINS.items())
+    late = dataclasses.replace(scene(6, snr_db=None, bits=None), trials=trials, start=0.3e-6)
+    return np.tile(ten()[0].pulses(loaded(late.simulate(seed=0))), (1, TEN // 2, 1))
+
+
 @pytest.mark.parametrize(
     "make", [functools.partial(Cole, alpha=0.98), functools.partial(TwoLayers, share=0.05)]
 )
 def test_skin_that_is_not_one_rc_is_refused_within_two_pulses(make):
     """Cole skin was `successful` with R_s 5 (dry) and 10 % (damp) off, 35 and 54 of its errors."""
     tracker, *_ = ten()
-    trials = tuple(Trial(name, make(skin)) for name, skin in SKINS.items())
-    quiet = dataclasses.replace(scene(6, snr_db=None, bits=None), trials=trials, start=0.3e-6)
-    clean = np.tile(tracker.pulses(loaded(quiet.simulate(seed=0))), (1, TEN // 2, 1))
-    found, _ = verdicts_of_pulses(tracker, with_noise(clean, seed=3))
+    found, _ = verdicts_of_pulses(tracker, with_noise(pulses_of(make), seed=3))
     assert (found[SOON - 1 :] == "misfit").all()
+
+
+outputs = eqx.filter_jit(GainModel.expected)
+
+
+@pytest.mark.parametrize("skin", SKINS)
+def test_the_spread_of_a_gain_is_that_of_the_exponent_of_j_omega(skin):
+    """Against central differences of the gain with (jω)^(1 + ε) in the time constant."""
+    tracker, *_ = ten()
+    model, step, of = tracker.model, 1e-5, SKINS[skin]
+    log_s = np.log(2j * np.pi * np.asarray(model.bands.frequency))
+    source = np.asarray(model.source)
+
+    def gain(epsilon):
+        z = of.r_s + of.r_p / (1 + np.exp((1 + epsilon) * log_s) * of.r_p * of.c_p)
+        return z / (z + source)
+
+    expected = outputs(model, etid.SkinRC(of.r_s, of.r_p, of.c_p).log_values())
+    np.testing.assert_allclose(expected.gain, gain(0.0), rtol=1e-9)
+    slope = (gain(step) - gain(-step)) / (2 * step)
+    # Curvature makes errors of step², and rounding of ε/step; G is at most 1.
+    np.testing.assert_allclose(expected.spread, slope, rtol=1e-6, atol=1e-9)
+
+
+def test_the_score_is_that_of_a_spread():
+    """Against other skin, in small steps: it has the information by which a test divides it."""
+    (tracker, *_), step = ten(), 1e-3
+    more, less = (
+        of_row(A_SPREAD, tracker, with_noise(pulses_of(functools.partial(Cole, alpha=alpha)), 4))
+        for alpha in (1 + step, 1 - step)
+    )
+    # 2 % as of the gain: the elements follow, by half a per cent of R_s.
+    np.testing.assert_allclose((more[0] - less[0]) / (2 * step), more[1], rtol=0.02)
+
+
+def test_a_spread_alone_makes_a_misfit():
+    """At 46 dB, where neither χ² of a pulse nor the test of the gain shows Cole's α = 0.98."""
+    tracker, *_ = ten()
+    clean = pulses_of(functools.partial(Cole, alpha=0.98))
+    noise = 5 * NOISE * np.random.default_rng(6).standard_normal(clean.shape)
+    state, refused = tracker.start(), 0
+    for v_out in clean + noise:
+        state = tracker.update(state, v_out)
+        score, information, common = np.moveaxis(np.asarray(state.electrodes.scores), -1, 0)
+        scatter = np.sqrt(information + common**2)
+        beyond = np.abs(score) - SEEN_IN_PULSES * scatter
+        blind = (np.asarray(state.electrodes.chi2) < MISFIT_CHI2) & (beyond[:, GAIN] < 0)
+        spread = beyond[:, A_SPREAD] > SPREAD * information[:, A_SPREAD]
+        said = verdict_names(state.electrodes.result)
+        np.testing.assert_array_equal(said[blind & spread], "misfit")
+        np.testing.assert_array_equal(said[blind & ~spread], "successful")
+        refused += int((blind & spread).sum())
+    assert refused > TEN
+
+
+@pytest.mark.parametrize(("skin", "amplitude"), [("dry", 0.1), ("damp", 0.3)])
+def test_weak_pulses_at_40_db_have_the_errors_that_they_state(skin, amplitude):
+    """Twenty pulses; the noise is that of 40 dB for pulses of the whole amplitude.
+
+    A tenth is too little behind damp skin: 3 of 80 were more than five standard errors off.
+    """
+    draws, lane, z = 8, list(SKINS).index(skin), []
+    tracker, *_ = ten()
+    clean = amplitude * tracker.pulses(loaded(quiet()))[:, lane : lane + 1]
+    for seed in range(draws):
+        rng = np.random.default_rng(seed)
+        noise = 10 * NOISE * rng.standard_normal((20, TEN, clean.shape[-1]))
+        pulses = clean[np.arange(20) % len(clean)] + noise
+        _, state = verdicts_of_pulses(tracker, pulses, amplitude)
+        z += list(off(tracker.read(state).successful(), TRUTH[lane]))
+    assert len(z) > 0.98 * draws * TEN
+    assert np.abs(z).max() < 5  # one of 240 normal numbers in 7 000 such tests
+    # The calibration has 60 dB, so that the electrodes err independently. 0.1 % beyond each limit.
+    low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], len(z))
+    squares = np.sum(np.square(z), axis=0)
+    assert ((low < squares) & (squares < high)).all(), np.sqrt(squares / len(z))
 
 
 def test_a_circuit_without_time_constants_has_no_spread():

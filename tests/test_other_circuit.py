@@ -12,7 +12,7 @@ import scipy.stats
 import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import CALIBRATION, LOADS, rung
-from benchmarks.perturbed_study import undisturbed
+from benchmarks.perturbed_study import all_records, out, undisturbed
 from etid.circuits.circuit import Resistor
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import FALSE_ALARMS, SEEN, other_circuit
@@ -194,13 +194,47 @@ def test_a_wrong_gain_is_seen_where_it_moves_r_p_by_a_quarter():
     assert etid.identify_skins(wrong, driver).counts()["misfit"] >= 8
 
 
+@pytest.mark.parametrize(
+    ("z", "likely"), [(2.4, False), (-3.0, True), (4.5, False), (np.nan, False)]
+)
+def test_a_gain_that_is_likely_goes_into_the_errors_and_one_that_is_proven_does_not(z, likely):
+    """With an error of 2 %, as large as gains are expected, the mean is half of the estimate."""
+    stderr, slope = 0.02, np.array([3.0, -2.0])
+    score = Score(*map(jnp.asarray, (z, z * stderr, 3 * abs(z) * stderr, stderr, slope)))
+    found, cov = Scores(score, score, score).doubt()
+    assert bool(found) is likely
+    expected = np.outer(slope, slope) * (z * stderr / 2) ** 2 if likely else np.zeros((2, 2))
+    np.testing.assert_allclose(cov, expected, rtol=1e-12)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("snr_db", [40.0, 50.0, 60.0])
+@pytest.mark.parametrize(("snr_db", "gain"), [(40.0, 1.01), (40.0, 0.99), (60.0, 1.001)])
+def test_a_gain_in_all_records_that_no_test_proves_is_in_the_errors(snr_db, gain):
+    """R_p of dry skin was 14 % wrong, 24 standard errors, in two of three recordings.
+
+    The score has three standard deviations: one of three is below `DOUBTED`, and 13 of 16 would be
+    so with a probability of 1e-4.
+    """
+    silent = 0
+    for number in range(8):
+        study = all_records(out(gain=gain))(undisturbed(number, snr_db))
+        driver = etid.identify_driver([of.recording(number) for of in study.calibrations])
+        for of in study.trials:
+            fit = etid.identify_skin(of.recording(number), driver, throw=False)
+            truth = np.array(dataclasses.astuple(LOADS[of.path]))
+            off_by = (np.array(fit.circuit.values()) - truth) / fit.stderr.values()
+            silent += fit.verdict == "successful" and bool(np.abs(off_by).max() > 5)
+    assert silent <= 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [30.0, 40.0, 50.0, 60.0])
 def test_good_recordings_are_refused_as_rarely_as_a_study_can_bear(snr_db):
     """Of 2000 with drawn drivers; six tests of 1 in 10 000 refuse 1.2 of them.
 
     More than seven have a probability of 4e-5. With a limit of three standard deviations for the
-    gain, 3 of 7200 recordings at 40 to 50 dB were refused, and 14 of 6664 of another draw.
+    gain, 3 of 7200 recordings at 40 to 50 dB were refused, and 14 of 6664 of another draw. At 24 dB
+    other reasons are more frequent: one driver of ten is unclear.
     """
     tests, drivers, seeds = 6, 10, 100
     verdicts = []

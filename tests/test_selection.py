@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks.perturbed_study import PARTS, drawn_driver
-from benchmarks.selection_draws import draws, errors
+from benchmarks.ladder import LOADS as TYPICAL
+from benchmarks.ladder import recorded
+from benchmarks.perturbation_list import PERTURBATIONS
+from benchmarks.perturbed_study import PARTS, drawn_driver, undisturbed
+from benchmarks.selection_draws import draws, errors, quantities
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
 from etid.results.fit import CHANGES, Fit, Support
@@ -19,6 +22,7 @@ from etid.selection.selection import Selection
 from etid.selection.unseen import WIDTH, hidden, posterior, unseen
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
+from tests.skins import off
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
@@ -389,3 +393,102 @@ def test_skin_that_is_not_one_rc_does_not_ask_for_a_calibration_first(load, snr_
         # A normal error exceeds 3.5 standard errors once in 2 000.
         error = float(found.fit.circuit.values()[0] - load.values()[0])
         assert abs(error) < 3.5 * float(np.sqrt(found.fit.cov[0, 0]))
+
+
+SINCE_CALIBRATION = 6  # drivers of a perturbation that only the skin's record has
+
+
+def perturbed(name, snr_db, number):
+    """Recordings of skin by path, and their driver, which is drawn."""
+    study = PERTURBATIONS[name](undisturbed(number, snr_db))
+    driver = etid.identify_driver([of.recording(number) for of in study.calibrations])
+    return {of.path: of.recording(1000 + number) for of in study.trials}, driver
+
+
+def resistances_off(fit, r_s, r_p):
+    """Errors of R_s, where a circuit has it, and of Z(0) [standard errors]."""
+    found, cov = quantities(fit.circuit), np.asarray(fit.cov)
+    truth = {"R_s": r_s, "Z(0)": r_s + r_p}
+    return {
+        of: (found[of][0] - truth[of]) / float(np.sqrt(found[of][1] @ cov @ found[of][1]))
+        for of in truth.keys() & found.keys()
+    }
+
+
+@pytest.mark.slow
+def test_an_inductor_in_series_is_found_where_the_circuit_has_one():
+    """Without one, some recordings of dry skin pass, with C_p 6 % too large as stated."""
+    written, plain = "L0-R0-p(R1,C1)", []
+    for number in range(SINCE_CALIBRATION):
+        records, driver = perturbed("inductance_5mH_skin", 60.0, number)
+        for path, recording in records.items():
+            truth = dataclasses.astuple(TYPICAL[path])
+            fit = etid.identify_skin(recording, driver, circuit=written, throw=False)
+            assert fit.verdict == "successful"
+            # One of 48 normal numbers in 36 000 such tests.
+            assert (np.abs(off(fit, (5e-3, *truth))) < 5).all()
+        plain.append(etid.identify_skin(records["dry"], driver, throw=False))
+    passed = [one for one in plain if one.verdict == "successful"]
+    assert 0 < len(passed) < SINCE_CALIBRATION
+    too_large = [float(one.circuit.c_p) / TYPICAL["dry"].c_p - 1 for one in passed]
+    # Four standard errors of C_p, of 0.4 % each.
+    np.testing.assert_allclose(too_large, 0.06, atol=0.016)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [50.0, 60.0])
+def test_a_capacitance_that_only_the_skin_has_passes_with_the_stated_error_of_r_s(snr_db):
+    """5 pF look like another R_s + R_p ‖ C_p: no choice between circuits shows them."""
+    dry, silent = TYPICAL["dry"], []
+    for number in range(SINCE_CALIBRATION):
+        records, driver = perturbed("capacitance_5pF_skin", snr_db, number)
+        fit = etid.identify_skin(records["dry"], driver, circuit="auto", throw=False)
+        if fit.verdict == "successful":
+            z = resistances_off(fit, dry.r_s, dry.r_p)
+            assert abs(z["Z(0)"]) < 5
+            silent.append((float(quantities(fit.circuit)["R_s"][0]) / dry.r_s - 1, z["R_s"]))
+    assert silent
+    too_small, z = np.array(silent).T
+    # 6 %, and three standard errors at 50 dB, of 0.7 % each.
+    np.testing.assert_allclose(too_small, -0.06, atol=0.021)
+    assert (z < 0).all()
+    assert (z > -28).all()  # 25 standard errors, and three
+
+
+@pytest.mark.slow
+def test_a_study_of_damp_skin_gets_one_rc_whose_resistances_are_right():
+    """A layer of diffusion, which damp skin at 40 dB may be, is in the standard errors."""
+    damp, recordings = TYPICAL["damp"], 6
+    for number in range(8):
+        behind = drawn_driver(number, PARTS, TransformerDriver())
+        loads = {f"damp/{i}": damp for i in range(recordings)}
+        made_study = recorded(loads, {"calibration": 98.8e3}, driver=behind, snr_db=40.0)
+        simulated = made_study.simulate(number)
+        driver = etid.identify_driver(simulated["calibration"])
+        fits = etid.identify_skins(list(simulated.loaded.recordings()), driver, circuit="auto")
+        assert type(fits.circuit) is etid.SkinRC
+        assert fits.counts() == {"successful": recordings}
+        for one in range(recordings):
+            z = resistances_off(fits[one], damp.r_s, damp.r_p)
+            # One of 96 normal numbers in 18 000 such tests.
+            assert max(abs(z["R_s"]), abs(z["Z(0)"])) < 5, (number, z)
+
+
+@pytest.mark.slow
+def test_three_layers_are_never_a_successful_circuit_that_is_wrong():
+    """No candidate has three; both that come nearest are refused by χ² above 3."""
+    kind = type(etid.circuit("R0-p(R1,C1)-p(R2,C2)-p(R3,C3)"))
+    layers = {"r_1": 100e3, "c_1": 0.1e-9, "r_2": 50e3, "c_2": 2e-9, "r_3": 40e3, "c_3": 20e-9}
+    r_s, r_p = 33.4e3, 190e3
+    load = kind(**{"r_0": r_s, **layers})
+    for number in range(3):
+        behind = drawn_driver(number, PARTS, TransformerDriver())
+        made_study = recorded({"three": load}, {"calibration": 98.8e3}, driver=behind)
+        simulated = made_study.simulate(number)
+        driver = etid.identify_driver(simulated["calibration"])
+        found = etid.select_circuit(simulated["three"], driver, throw=False)
+        assert len(found.candidates) >= 4
+        assert found.residual  # says what the candidates lack
+        for fit in (found.fit, *(one.fit for one in found.candidates)):
+            z = resistances_off(fit, r_s, r_p)
+            assert fit.verdict != "successful" or max(map(abs, z.values())) < 5, (number, z)

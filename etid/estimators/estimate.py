@@ -47,6 +47,7 @@ class Estimate(eqx.Module):
         falls: Whether a resistance that falls with its current explains most of the misfit.
         late: Whether a resistance that follows its current late explains the residual; only
             a fit of several amplitudes tests for it.
+        doubtful: Whether another gain is likely; `cov` contains its effect.
         support: How well the data support this circuit; None if the estimator does not compute it.
     """
 
@@ -64,6 +65,7 @@ class Estimate(eqx.Module):
     hum: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     falls: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     late: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
+    doubtful: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     support: Support | None = None
 
 

@@ -108,22 +108,19 @@ def judged(
         ),
         steps=estimate.steps,
         method=method,
-        remarks=remarks(estimate.hum, estimate.falls, estimate.late) + at_bound,
+        remarks=remarks(estimate) + at_bound,
         support=support or Support.unknown(values.size),
         limits=limited(circuit, own, outside),
     )
 
 
-def remarks(
-    hum: Bool[Array, ""],
-    falls: Bool[Array, ""] | bool = False,
-    late: Bool[Array, ""] | bool = False,
-) -> Int[Array, ""]:
-    """`mains_hum`, `falls_with_current` and `follows_late`, each if its argument is true."""
+def remarks(estimate: Estimate) -> Int[Array, ""]:
+    """The remarks that an estimate makes."""
     of = (
-        (hum, Remark.mains_hum),
-        (falls, Remark.falls_with_current),
-        (late, Remark.follows_late),
+        (estimate.hum, Remark.mains_hum),
+        (estimate.falls, Remark.falls_with_current),
+        (estimate.late, Remark.follows_late),
+        (estimate.doubtful, Remark.gain_doubtful),
     )
     return sum((jnp.where(on, int(one), 0) for on, one in of), jnp.zeros((), int))
 

@@ -152,7 +152,7 @@ def _fields(baseline: Rational, estimate: Estimate, rate: Float[Array, ""]) -> d
         "chi2": estimate.chi2,
         "steps": estimate.steps,
         "start": estimate.start,
-        "remarks": remarks(estimate.hum),
+        "remarks": remarks(estimate),
     }
 
 

@@ -439,7 +439,7 @@ def _alone_judged(fits: Fit, changed: Sequence[bool]) -> Fit:
     explained = np.asarray(changed) & np.isin(names, ("successful", "misfit"))
     result = verdicts_of(np.where(explained, "inconsistent", names))
     # The fit of each recording alone decides whether hum is left out.
-    return dataclasses.replace(fits, remarks=fits.remarks & int(Remark.at_bound), result=result)
+    return dataclasses.replace(fits, remarks=fits.remarks & ~int(Remark.mains_hum), result=result)
 
 
 def _model(options: Options, driver: HarmonicDriver, shared: bool) -> Joint:

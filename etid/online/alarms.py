@@ -68,7 +68,7 @@ import jax.numpy as jnp
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from etid.estimators.score_tests.other_circuit import MOVED, NOTHING, SPREAD
+from etid.estimators.score_tests.other_circuit import MOVED, NOTHING, SPREAD, Score
 from etid.online.pulse_fit import Expected, Pulse
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, power
@@ -227,3 +227,13 @@ class PulseScores(NamedTuple):
         scatter = jnp.sqrt(information + common**2)
         allowed = jnp.stack([MOVED / jnp.max(jnp.abs(self.moved)), jnp.asarray(SPREAD)])
         return jnp.any(jnp.abs(score) - SEEN_IN_PULSES * scatter > allowed * information)
+
+
+def score_of(sums: Float[Array, " 3"], slope: Float[Array, " element"]) -> Score:
+    """The score of a change from its sums s, I and c, and the slopes of the elements."""
+    score, information, common = sums
+    scatter, tested = jnp.sqrt(information + common**2), information > 0
+    information = jnp.where(tested, information, 1.0)
+    size = score / information
+    z = jnp.where(tested, score / jnp.where(tested, scatter, 1.0), jnp.nan)
+    return Score(z, size, jnp.abs(size) * jnp.max(jnp.abs(slope)), scatter / information, slope)

@@ -14,8 +14,9 @@ from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
 from etid.estimators.registry import register_description
 from etid.estimators.score_tests.other_circuit import MOVED, SPREAD
 from etid.estimators.unknowns import LoadUnknowns
-from etid.online.alarms import SEEN_IN_PULSES
+from etid.online.alarms import SEEN_IN_PULSES, score_of
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
+from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, counted, first_verdict, verdict_names
 from etid.signals.harmonics import real_parts
@@ -164,11 +165,14 @@ def fit_of(
     pulse = Pulse(model, jnp.zeros_like(expected.gain), weight, logs, nothing)
     jacobian = pulse.jacobian(expected)
     by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
-    by_error = as_complex(jnp.sqrt(weight))[None, :] * model.by_error(expected.gain)
+    roots = as_complex(jnp.sqrt(weight))
+    by_error = roots[None, :] * model.by_error(expected.gain)
     of_source = by_term @ real_parts(by_error).T
     # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
     of_x = jnp.tile(power(expected.gain) * bands.variance_x / state.variance, 2)
-    shared = of_source @ of_source.T + (by_term * of_x[None, :]) @ by_term.T
+    slope = -by_term @ real_parts(roots * expected.gain)
+    likely, doubt = score_of(state.scores[0], slope).doubt()
+    shared = of_source @ of_source.T + (by_term * of_x[None, :]) @ by_term.T + doubt
     cov = inverse(state.information) + shared
     relative = jnp.sqrt(jnp.diagonal(cov))
     fitted = model.circuit.with_log_values(logs)
@@ -188,6 +192,7 @@ def fit_of(
         ),
         steps=state.pulses,
         method=METHOD,
+        remarks=jnp.where(likely, int(Remark.gain_doubtful), 0),
     )
 
 

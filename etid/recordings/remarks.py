@@ -29,6 +29,7 @@ class Remark(enum.IntFlag):
     positive_imaginary = enum.auto()
     no_phase = enum.auto()
     periods_shifted = enum.auto()
+    gain_doubtful = enum.auto()
 
 
 _TEXTS = {
@@ -84,6 +85,10 @@ _TEXTS = {
     Remark.periods_shifted: (
         "From one pulse period to another, v_out is shifted by whole samples: a sample was lost or "
         "recorded twice. The periods were aligned; check the recorder."
+    ),
+    Remark.gain_doubtful: (
+        "The residual looks like another gain of v_out, too weakly to prove it. The standard "
+        "errors contain what this gain would change; check the gains of both records."
     ),
 }
 

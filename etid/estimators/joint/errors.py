@@ -166,24 +166,29 @@ def estimates(
             if by_x is not None:  # its correlation with `common` makes less than 3 % of an error
                 of_x = jnp.where(load.unloaded >= 0, by_x.of_own.T @ by_x.of_own, 0.0)
                 private, shared = private - of_x, shared + of_x
+            other, scale = _scores(at, load, own, eliminated, bread, total.score)
+            likely, doubt = other.doubt()
             e = own.log_elements.size
             estimate = Estimate(
                 parameters=own.log_elements,
                 delay_samples=own.vector()[e:],
-                cov=whole[:e, :e],
-                shared_cov=shared[:e, :e],
+                cov=whole[:e, :e] + doubt,
+                shared_cov=shared[:e, :e] + doubt,
                 chi2=at.chi2,
                 rrse=at.rrse,
                 result=optx.RESULTS.where(result == optx.RESULTS.successful, least.result, result),
                 steps=least.points,
                 strain=strain,
+                doubtful=likely,
             )
             delay = Delay(own.delay_samples, private[e, e], eliminated.slope[e])
-            other, scale = _contradictions(at, load, own, eliminated, bread, total.score)
             width = of.delay_width
             late = load_fit.beyond(own.delay_samples / width, whole[e, e] / width**2)
             by_error = of.errors(eliminated.slope[:e] @ bread)
-            return Found(estimate, other, scale | beyond | (late & load.used), delay, by_error)
+            # A load that takes no part has its own verdict.
+            wrong = (other.seen() | other.has_other_gain()) & load.used
+            inconsistent = beyond | ((scale | late) & load.used)
+            return Found(estimate, wrong, inconsistent, delay, by_error)
 
         judged.append(in_turn(one, loads, own, *each, results))
     return cov, judged
@@ -246,15 +251,15 @@ def _by_noise(linear: Linear, gains: Complex[Array, "output x"]) -> Float[Array,
     return jnp.concatenate([of.sum(1).T for of in both])
 
 
-def _contradictions(
+def _scores(
     at: _AtMinimum,
     load: Loads,
     own: LoadUnknowns,
     eliminated: _Eliminated,
     bread: Float[Array, "common common"],
     score: Float[Array, "common common"],
-) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether a load shows another circuit or gain, and another scale of the current.
+) -> tuple[other_circuit.Scores, Bool[Array, ""]]:
+    """What a load shows of another circuit or gain, and whether the current has another scale.
 
     `bread` and `score` are those of `common` from all terms.
     """
@@ -282,9 +287,7 @@ def _contradictions(
             jax.tree.map(lambda leaf, part=part: leaf[part], found) for part in (slice(-1), -1)
         )
         scale = of_current.contradicts()
-    other = other_circuit.Scores.of(found)
-    # A load that takes no part has its own verdict.
-    return (other.seen() | other.has_other_gain()) & load.used, scale & load.used
+    return other_circuit.Scores.of(found), scale
 
 
 def _eliminated(at: _AtMinimum, c: int) -> _Eliminated:

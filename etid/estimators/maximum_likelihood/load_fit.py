@@ -116,7 +116,8 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     of_own = (elements[:, :owned] * prior[None, :owned]) @ elements[:, :owned].T
     of_driver = elements[:, owned:] @ driver.cov @ elements[:, owned:].T
     by_term = elements @ linear.jacobian
-    shared = of_driver + (by_term * (linear.noise - own_noise)[None, :]) @ by_term.T
+    likely, doubt = other.doubt()
+    shared = of_driver + (by_term * (linear.noise - own_noise)[None, :]) @ by_term.T + doubt
     # For an element without any effect the matrix product contains only rounding errors.
     unknown = jnp.diagonal(elements)
     unknown = jnp.diag(jnp.where(unknown > 1, unknown, 0.0))
@@ -138,6 +139,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
         strain=strain,
         hum=profile.shows_hum(records) & ~wrong_gain,
         falls=falling.causes(squares, terms, other.relevant()),
+        doubtful=likely,
         support=Support(
             squares + strain + beside - 2 * least.promised,
             terms,

@@ -22,7 +22,9 @@ ln s + ε ln² (s/s₀) around the middle s₀ of the band, and
 This test also has power if dZ/ds = 0, as for a resistor. A change that the circuit can make itself
 is no evidence: d vanishes. An example is a relaxation with a τ that the circuit has already.
 
-The same score also tests for another gain of V_out, which is no change of the circuit.
+The same score also tests for another gain of V_out, which is no change of the circuit. Most gains
+of 1 % are not seen at 40 dB, and would change R_p of dry skin by 14 %. What the score shows of a
+gain without proving it goes into the standard errors.
 """
 
 from typing import NamedTuple
@@ -43,6 +45,8 @@ SEEN_RELAXATION = 5.0
 # α or ε must also deviate by this, which changes R_s by a few per cent. A driver whose order is too
 # low can imitate 0.002: four standard deviations at 60 dB with damp skin.
 SPREAD = 0.01
+DOUBTED = 2.5  # standard deviations of a gain that goes into ±; one good recording in 80 has them
+GAIN = 0.02  # standard deviation of the gain between two channels that nobody compared
 MOVED = 0.02  # relative change of an element that is also necessary, for the same reason
 # For a methods section.
 NO_OTHER_CIRCUIT = (
@@ -152,6 +156,17 @@ class Score(NamedTuple):
         deviations = jnp.where(negative, jnp.inf, 1 / self.stderr)
         return jnp.where(jnp.isfinite(self.z), deviations, 0.0)
 
+    def doubt(self) -> tuple[Bool[Array, ""], Float[Array, "element element"]]:
+        """Whether a gain is likely, and the covariance that it then adds.
+
+        One standard deviation of the logarithms of the elements is what they change by its mean,
+        given the score and a prior of width `GAIN`.
+        """
+        likely = jnp.abs(self.z) > DOUBTED
+        mean = self.size / (1 + (self.stderr / GAIN) ** 2)
+        moved = jnp.where(likely, mean, 0.0) * self.slope
+        return likely, jnp.outer(moved, moved)
+
     def contradicts(self) -> Bool[Array, "*change"]:
         """Whether the scale of a measured current is wrong; all changes must be such scales."""
         return (jnp.abs(self.z) > SEEN) & (self.moved > SCALE)
@@ -197,6 +212,12 @@ class Scores(NamedTuple):
     def has_other_gain(self) -> Bool[Array, ""]:
         """Whether the score shows that V_out and V_th have different gains."""
         return self.gain.exceeds(SEEN)
+
+    def doubt(self) -> tuple[Bool[Array, ""], Float[Array, "element element"]]:
+        """`Score.doubt` of the gain; none if it is proven, for then the fit is a misfit."""
+        likely, cov = self.gain.doubt()
+        proven = self.has_other_gain()
+        return likely & ~proven, jnp.where(proven, 0.0, cov)
 
 
 def scores(
