@@ -1,6 +1,7 @@
 """WAV, LabVIEW, Excel and npz files, arrays, and one long record that holds several trials."""
 
 import numpy as np
+import openpyxl
 import pytest
 import scipy.io.wavfile
 
@@ -109,7 +110,6 @@ def test_a_labview_file_may_have_coarse_times_more_samples_and_a_cut_end(tmp_pat
 
 
 def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
-    openpyxl = pytest.importorskip("openpyxl")
     th, out = pulses(2)
     book = openpyxl.Workbook()
     book.active.append(["t (s)", "open", "finger [mV]"])

@@ -171,7 +171,8 @@ def test_a_lost_worker_keeps_what_is_done(source, tmp_path):
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(source, whole, tmp_path):
     """A real scheduler and two worker processes, of which one is killed while it works."""
-    distributed = pytest.importorskip("distributed")
+    import distributed
+
     target = tmp_path / "fits.h5"
     with (
         distributed.LocalCluster(
