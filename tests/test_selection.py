@@ -10,7 +10,7 @@ from benchmarks.ladder import LOADS as TYPICAL
 from benchmarks.ladder import recorded
 from benchmarks.perturbation_list import PERTURBATIONS
 from benchmarks.perturbed_study import PARTS, drawn_driver, undisturbed
-from benchmarks.selection_draws import draws, errors, quantities
+from benchmarks.selection_draws import TRUTHS, draws, errors, quantities
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
 from etid.results.fit import CHANGES, Fit, Support
@@ -456,22 +456,33 @@ def test_a_capacitance_that_only_the_skin_has_passes_with_the_stated_error_of_r_
 
 
 @pytest.mark.slow
-def test_a_study_of_damp_skin_gets_one_rc_whose_resistances_are_right():
-    """A layer of diffusion, which damp skin at 40 dB may be, is in the standard errors."""
-    damp, recordings = TYPICAL["damp"], 6
-    for number in range(8):
+@pytest.mark.parametrize(
+    ("name", "snr_db"),
+    [
+        # A layer of diffusion, which damp skin at 40 dB may be, is in the standard errors.
+        ("one RC, damp", 40.0),
+        # 51 to 76 % of the intervals held R_s, which was up to 6.4 of its errors off.
+        ("layers 0.5, 2, damp", 50.0),
+        ("layers 0.5, 4.5, dry", 30.0),
+    ],
+)
+def test_the_common_circuit_of_a_study_leaves_resistances_within_their_errors(name, snr_db):
+    load, recordings, z = TRUTHS[name], 6, []
+    r_s, *others = (
+        of for of, one in zip(load.values(), load.names(), strict=True) if one[0] == "r"
+    )
+    for number in range(6):
         behind = drawn_driver(number, PARTS, TransformerDriver())
-        loads = {f"damp/{i}": damp for i in range(recordings)}
-        made_study = recorded(loads, {"calibration": 98.8e3}, driver=behind, snr_db=40.0)
-        simulated = made_study.simulate(number)
+        loads = {f"skin/{i}": load for i in range(recordings)}
+        scene = recorded(loads, {"calibration": 98.8e3}, driver=behind, snr_db=snr_db)
+        simulated = scene.simulate(number)
         driver = etid.identify_driver(simulated["calibration"])
         fits = etid.identify_skins(list(simulated.loaded.recordings()), driver, circuit="auto")
-        assert type(fits.circuit) is etid.SkinRC
         assert fits.counts() == {"successful": recordings}
-        for one in range(recordings):
-            z = resistances_off(fits[one], damp.r_s, damp.r_p)
-            # One of 96 normal numbers in 18 000 such tests.
-            assert max(abs(z["R_s"]), abs(z["Z(0)"])) < 5, (number, z)
+        z += [[*resistances_off(fits[i], r_s, sum(others)).values()] for i in range(recordings)]
+    assert np.abs(z).max() < 5
+    # Recordings of a driver share its error: 36 intervals are worth six to twelve.
+    assert (np.mean(np.abs(z) < 1.96, axis=0) > 0.7).all()
 
 
 @pytest.mark.slow
