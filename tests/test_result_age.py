@@ -13,6 +13,7 @@ MADE_BY = {  # tables whose names are not those of their benchmarks
     "silent_failures": "failure_map",
     "perturbation_pairs": "perturbations --pairs 500",
     "selection_map": "selection",
+    "coverage": "coverage --snr-db 40 60 --method default joint -o FILE",
 }
 # No number of a benchmark depends on them.
 SHOWN = (
