@@ -33,10 +33,10 @@ from etid.online.tick import (
 from etid.results.verdicts import RESULTS, verdict_names, verdicts_of
 
 NUMBER, LIMIT = 77, 10.0
-POWERS = np.array([1.0, -1.0])  # of a resistor and of a capacitor
 OLD, FOUND, FRESH = np.array([1.0, 2.0, 0.1]), np.array([1.1, 2.1, 0.2]), np.array([7.0, 2.2, 0.3])
 BEFORE = np.array([[50.0, 5.0], [5.0, 40.0]])
 TOLD, ALONE = np.array([[30.0, 2.0], [2.0, 20.0]]), np.array([[60.0, 3.0], [3.0, 70.0]])
+SHAPE, NEW_SHAPE = np.array([[3.0, 1.0], [1.0, 2.0]]), np.array([[4.0, -1.0], [-1.0, 2.0]])
 GOOD, BAD, LATE = SUCCESSFUL, RESULTS.misfit, MAX_STEPS_REACHED
 
 
@@ -91,6 +91,7 @@ def electrode(of: Case) -> tuple[Any, ...]:
         offset=0.25,
         shown=np.array([5.0, 6.0]),
         scores=np.array([[30.0, 100.0, 1.0], [0.0, 1.0, 1.0]]),
+        shape=SHAPE,
         confirmed=0.7,
         level=0.3,
         variance=0.4,
@@ -117,17 +118,19 @@ def electrode(of: Case) -> tuple[Any, ...]:
     )
     sums = [[-150.0 if of.gain else 1.0, 90.0, 2.0], [1.0, 1.0, 0.0]]
     scores = SCORES(np.array(sums), np.array([0.5, -8.0]))
-    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, GOOD if of.found else BAD, scores)
+    result = GOOD if of.found else BAD
+    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, result, scores, NEW_SHAPE)
     own = np.array([*(OLD[:2] + 1e-3), 0.3]) if of.near else FRESH
-    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, RESULT[of.fresh], scores)
+    result = RESULT[of.fresh]
+    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, result, scores, 2 * SHAPE)
     z = np.array([0.1, 0.2])
     suspected = SUSPICION(of.jump, of.drift, np.array([0.7, 0.8]), 0.02 * BEFORE, 0, z)
-    return state, measured, BEFORE, found, fresh, suspected, LIMIT, NUMBER, POWERS
+    return state, measured, BEFORE, found, fresh, suspected, LIMIT, NUMBER
 
 
 def expected(of: Case) -> dict[str, Any]:
     """The rules, one electrode at a time."""
-    state, measured, before, found, fresh, suspected, limit, number, powers = electrode(of)
+    state, measured, before, found, fresh, suspected, limit, number = electrode(of)
     again = not of.running or of.jump or of.drift
     used = fresh if again else found
     good = of.fresh == "good" if again else of.found
@@ -142,8 +145,8 @@ def expected(of: Case) -> dict[str, Any]:
     lost = of.running and (missed >= PATIENCE or of.off)
     information, pulses = before, state["pulses"]
     if good:
-        grown = np.diag(np.exp(powers * factor))
-        summed = grown @ (used.information + before) @ grown
+        turn = np.linalg.cholesky(used.shape) @ np.linalg.inv(np.linalg.cholesky(state["shape"]))
+        summed = turn @ before @ turn.T + used.information
         information = used.information if again else summed
         pulses = 1 if again else state["pulses"] + 1
     mean, mean_cov = state["mean"], state["mean_cov"]
@@ -179,6 +182,7 @@ def expected(of: Case) -> dict[str, Any]:
         "shown": [4.0, 5.0],
         "confirmed": confirmed,
         "scores": sums,
+        "shape": used.shape if good else state["shape"],
         "mean": mean,
         "mean_cov": mean_cov,
         "event": JUMP if jumped else DRIFT if drifted else NONE,
@@ -515,7 +519,7 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(monkeypatch):
     @jax.jit
     @jax.vmap
     def alone(spread, result):
-        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, scores)
+        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, scores, two)
         monkeypatch.setattr(tick, "attempt", lambda *_: fit)
         return anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two).result
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from etid.solvers.matrices import inverse, inverse_of_few, inverse_root, root
+from etid.solvers.matrices import inverse, inverse_of_few, inverse_root, root, root_of_few
 
 # Rounding of an inverse: machine epsilon times the condition of the scaled matrix, below 1e3 here.
 EXACT = 1e-12
@@ -25,9 +25,12 @@ def test_an_inverse_is_exact_whatever_the_units_are(function):
     np.testing.assert_allclose(product * scale[:, None] / scale, np.eye(4), atol=EXACT)
 
 
-def test_a_root_gives_the_matrix():
+@pytest.mark.parametrize("function", [root, root_of_few])
+def test_a_root_gives_the_matrix(function):
     matrix, scale = covariance()
-    found = np.asarray(square(root(jnp.asarray(matrix))))
+    factor = np.asarray(function(jnp.asarray(matrix)))
+    np.testing.assert_array_equal(factor, np.tril(factor))
+    found = square(factor)
     np.testing.assert_allclose(found / scale[:, None] / scale, matrix / scale[:, None] / scale,
                                rtol=1e-10)  # fmt: skip  # the ridge of 1e-12 times the condition
 

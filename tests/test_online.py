@@ -402,22 +402,30 @@ def test_a_change_of_a_few_electrodes_is_theirs_and_one_of_all_the_driver_s():
     assert set(tracker.read(tracker.update(found, pulse)).verdicts) == {"inconsistent"}
 
 
-def test_weak_pulses_do_not_add_up_to_a_wrong_answer():
-    """A fifteenth of the amplitude at 40 dB."""
-    amplitude, draws, z = 0.067, 8, []
+@pytest.mark.parametrize("amplitude", [0.067, 0.1])
+@pytest.mark.parametrize("count", [5, 40])
+def test_weak_pulses_do_not_add_up_to_a_wrong_answer(amplitude, count):
+    """Damp skin at 40 dB, where a pulse hardly knows R_s, and what it knows depends on R_s.
+
+    Of information that is added up as it was, 22 of 80 were more than four standard errors off
+    after 40 pulses, and R_s up to 17 after five.
+    """
+    draws, z = 8, []
     tracker, *_ = ten()
     pulses = amplitude * tracker.pulses(loaded(quiet()))[:, 1:]
     for seed in range(draws):
         state = tracker.start()
-        for number in range(40):
+        for number in range(count):
             clean = np.repeat(pulses[number % 10], TEN, 0)
             noisy = clean + 10 * (with_noise(clean, 40 * seed + number) - clean)
             state = tracker.update(state, noisy, amplitude)
         fits = tracker.read(state).successful()
         z += list(off(fits, TRUTH[1]))
-    assert len(z) > 0.98 * draws * TEN
-    # 3 of 80, and by chance 2 more or less; of information that is added up, 22 of 80.
-    assert np.sum(np.abs(z).max(1) > 4) < 10
+    # With a fifteenth of the amplitude a pulse may know an element by less than its size.
+    assert len(z) > 0.9 * draws * TEN
+    # The distribution is not quite normal: one in a hundred is beyond four.
+    assert np.sum(np.abs(z).max(1) > 4) <= 4
+    assert np.sum(np.abs(z).max(1) > 5) <= 1
 
 
 def test_an_amplitude_that_is_told_is_no_change():

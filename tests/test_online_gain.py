@@ -226,10 +226,7 @@ def test_a_spread_alone_makes_a_misfit():
 
 @pytest.mark.parametrize(("skin", "amplitude"), [("dry", 0.1), ("damp", 0.3)])
 def test_weak_pulses_at_40_db_have_the_errors_that_they_state(skin, amplitude):
-    """Twenty pulses; the noise is that of 40 dB for pulses of the whole amplitude.
-
-    A tenth is too little behind damp skin: 3 of 80 were more than five standard errors off.
-    """
+    """Twenty pulses; the noise is that of 40 dB for pulses of the whole amplitude."""
     draws, lane, z = 8, list(SKINS).index(skin), []
     tracker, *_ = ten()
     clean = amplitude * tracker.pulses(loaded(quiet()))[:, lane : lane + 1]

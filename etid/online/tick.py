@@ -31,7 +31,7 @@ from etid.online.pulse_fit import (
 from etid.online.state import DRIFT, JUMP, NONE, OPEN, ElectrodeState, TrackerState
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.transfer import as_complex, power
-from etid.solvers.matrices import inverse_of_few
+from etid.solvers.matrices import inverse_of_few, root_of_few
 
 STEADY = 0.1  # relative change of amplitude up to which the mean of a window is its offset
 FLAT = 4.0  # power relative to that of noise alone; below this, the pulse is `flat`
@@ -76,6 +76,8 @@ class Attempt(NamedTuple):
         rrse: RRSE of the pulse.
         result: Verdict.
         scores: PulseScores of a gain and of a spread.
+        shape: Information about the elements where this pulse was linearised, of a pulse with the
+            weight of the unloaded record.
     """
 
     own: Float[Array, "*lane own"]
@@ -85,6 +87,7 @@ class Attempt(NamedTuple):
     rrse: Float[Array, "*lane"]
     result: RESULTS
     scores: PulseScores
+    shape: Float[Array, "*lane element element"]
 
 
 class Suspicion(NamedTuple):
@@ -145,7 +148,7 @@ def updated(
         wanted,
         logs,
     )
-    after = jax.vmap(partial(after_pulse, limit=limit, number=number, powers=powers))(
+    after = jax.vmap(partial(after_pulse, limit=limit, number=number))(
         before, measured, information, found, fresh, suspected
     )
     counts = running & measured.steady & (measured.bad == SUCCESSFUL)
@@ -254,7 +257,8 @@ def attempt(
         (~(decrement < SETTLED**2), MAX_STEPS_REACHED),
         (misses(chi2, rrse) & ~noisy | late, RESULTS.misfit),
     )
-    return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, scores)
+    shape = told * (jnp.sum(model.bands.weight) / jnp.sum(measured.weight))
+    return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, scores, shape)
 
 
 def _tracked(
@@ -313,6 +317,23 @@ def anew(
     return found._replace(result=result)
 
 
+def turned(
+    information: Float[Array, "element element"],
+    before: Float[Array, "element element"],
+    after: Float[Array, "element element"],
+) -> Float[Array, "element element"]:
+    """Information about the elements, brought from one linearisation to another.
+
+    A weak pulse hardly knows one direction, which turns from estimate to estimate. Several pulses,
+    each linearised elsewhere, would seem to know it well. With L Lᵀ and M Mᵀ, what one pulse tells
+    `before` and `after`, M L⁻¹ turns the directions of one into those of the other.
+    """
+    back = root_of_few(before).T @ inverse_of_few(before)  # L⁻¹
+    turn = root_of_few(after) @ back
+    moved = turn @ information @ turn.T
+    return jnp.where(jnp.isfinite(moved).all(), moved, information)
+
+
 def suspicion(
     state: ElectrodeState,
     found: Attempt,
@@ -345,7 +366,6 @@ def after_pulse(
     suspected: Suspicion,
     limit: Float[Array, ""],
     number: Int[Array, ""],
-    powers: Float[Array, " element"],
 ) -> ElectrodeState:
     """State of one electrode after one pulse."""
     running = state.pulses > 0
@@ -370,11 +390,7 @@ def after_pulse(
     fits = running & good & ~suspected.jump & ~wrong
     reached = jnp.maximum(state.confirmed, measured.amplitude)
     begun = ~running & (used.result == MAX_STEPS_REACHED)
-    # An impedance is nearly linear in resistances and in 1/C, less so in their logarithms: what is
-    # known of R in ohm stays, so that what is known of log R grows with R². Otherwise pulses weigh
-    # more where noise made R larger.
-    grown = jnp.exp(powers * factor)
-    summed = (information + used.information) * grown[:, None] * grown[None, :]
+    summed = turned(information, state.shape, used.shape) + used.information
     gained = jnp.where(restarted, used.information, summed)
     followed = good & ~again
     return ElectrodeState(
@@ -387,6 +403,7 @@ def after_pulse(
         shown=jnp.stack([measured.shown, state.shown[0]]),
         confirmed=jnp.where(fits, reached, jnp.where(silent, state.confirmed, 0.0)),
         scores=sums,
+        shape=jnp.where(good, used.shape, state.shape),
         level=jnp.where(silent, state.level, measured.level),
         variance=jnp.where(silent, state.variance, measured.variance),
         chi2=jnp.where(silent, state.chi2, used.chi2),

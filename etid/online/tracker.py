@@ -12,8 +12,9 @@ the gains of `etid.online.gain_bands`:
 
     Λ⁻ = (Λ⁻¹ + q² 1)⁻¹                                              (a random walk of the skin)
     minimise  |ϑ − ϑ⁻|²_Λ⁻ + Σ w |Ĝ e^(jωτ) − G(ϑ)|² / σ²   over ϑ and τ
-    Λ  = Λ⁻ + H_ϑϑ − H_ϑτ H_τϑ / H_ττ,                               H = JᵀJ
+    Λ  = T Λ⁻ Tᵀ + H_ϑϑ − H_ϑτ H_τϑ / H_ττ,                          H = JᵀJ
 
+T turns what the pulses before tell to where this one is linearised (`etid.online.tick.turned`).
 Aliases and the curvature of G over a band are computed with ϑ⁻ and subtracted from Ĝ.
 
 **Each pulse has its own delay τ.** This is right if a trigger starts each window. It is also right
@@ -219,6 +220,7 @@ class Tracker(Overviewed):
             offset=nan,
             shown=jnp.full((lanes, 2), jnp.nan),
             scores=jnp.zeros((lanes, 2, 3)),
+            shape=jnp.zeros((lanes, elements, elements)),
             confirmed=jnp.zeros(lanes),
             level=nan,
             variance=nan,

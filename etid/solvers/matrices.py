@@ -41,6 +41,17 @@ def inverse_of_few(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return work[:, size:] / scale[:, None] / scale[None, :]
 
 
+def root_of_few(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Cholesky's factor L of a positive definite matrix of a few rows, for all lanes at once."""
+    scaled, scale = _unit_diagonal(matrix)
+    columns, left = [], np.arange(matrix.shape[0])
+    for i in left:
+        column = jnp.where(left >= i, scaled[:, i], 0.0) / jnp.sqrt(scaled[i, i])
+        columns.append(column)
+        scaled = scaled - column[:, None] * column[None, :]
+    return jnp.stack(columns, axis=1) * scale[:, None]
+
+
 def root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A matrix L with L Lᵀ = M, for a positive semidefinite M."""
     factor, scale = _factor(matrix)
