@@ -24,7 +24,8 @@ def test_many_new_objects_are_not_searched_and_what_is_frozen_stays_frozen():
         frozen = gc.get_freeze_count()
         with unsearched():
             kept += [[] for _ in range(2 * MANY)]
-        assert gc.get_freeze_count() == frozen
+        # Undone it would be 0; a few frozen objects may die.
+        assert gc.get_freeze_count() > 0.9 * frozen
     finally:
         gc.unfreeze()
 
