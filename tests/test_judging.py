@@ -133,7 +133,8 @@ def test_what_an_estimate_shows_beside_its_elements_are_remarks():
         "doubtful": Remark.gain_doubtful,
     }
     for seen in itertools.product([True, False], repeat=len(names)):
-        of = estimate(**dict(zip(names, map(jnp.asarray, seen), strict=True)))
+        flags: Any = dict(zip(names, map(jnp.asarray, seen), strict=True))
+        of = estimate(**flags)
         expected = sum(name for name, one in zip(names.values(), seen, strict=True) if one)
         assert int(remarks(of)) == expected
         assert int(judged(of, etid.SkinRC(), SUCCESSFUL, "a method").remarks) == expected

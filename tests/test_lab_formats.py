@@ -1,5 +1,7 @@
 """WAV, LabVIEW, Excel and npz files, arrays, and one long record that holds several trials."""
 
+from typing import Any
+
 import numpy as np
 import openpyxl
 import pytest
@@ -111,7 +113,7 @@ def test_a_labview_file_may_have_coarse_times_more_samples_and_a_cut_end(tmp_pat
 
 def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
     th, out = pulses(2)
-    book = openpyxl.Workbook()
+    book: Any = openpyxl.Workbook()
     book.active.append(["t (s)", "open", "finger [mV]"])
     for i, (a, b) in enumerate(zip(th, out, strict=True)):
         book.active.append([i / RATE, float(a), 1e3 * float(b)])

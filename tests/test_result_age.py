@@ -53,9 +53,9 @@ def code(commit, names):
         text = git("show", f"{commit}:{name}").stdout if name.endswith(".py") else ""
         tree = ast.parse(text)
         for node in ast.walk(tree):
-            described = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-            if described and ast.get_docstring(node) is not None:
-                del node.body[0]
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                if ast.get_docstring(node) is not None:
+                    del node.body[0]
         for node in tree.body:
             if not isinstance(node, ast.Import | ast.ImportFrom):
                 found[ast.dump(node)] = name

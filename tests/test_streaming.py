@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import contextlib
+import importlib
 import os
 import pathlib
 import signal
@@ -171,8 +172,7 @@ def test_a_lost_worker_keeps_what_is_done(source, tmp_path):
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(source, whole, tmp_path):
     """A real scheduler and two worker processes, of which one is killed while it works."""
-    import distributed
-
+    distributed: Any = importlib.import_module("distributed")
     target = tmp_path / "fits.h5"
     with (
         distributed.LocalCluster(
