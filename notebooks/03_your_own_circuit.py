@@ -29,7 +29,7 @@
 import etid
 from etid.circuits.elements import Exponent, Farad, Ohm, Second
 
-SEED = 0
+SEED = 2
 
 
 # %% [markdown]
