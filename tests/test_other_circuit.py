@@ -210,10 +210,9 @@ def test_a_gain_that_is_likely_goes_into_the_errors_and_one_that_is_proven_does_
 @pytest.mark.slow
 @pytest.mark.parametrize(("snr_db", "gain"), [(40.0, 1.01), (40.0, 0.99), (60.0, 1.001)])
 def test_a_gain_in_all_records_that_no_test_proves_is_in_the_errors(snr_db, gain):
-    """R_p of dry skin was 14 % wrong, 24 standard errors, in two of three recordings.
+    """Without that, 11, 7 and 15 of 16 were wrong, R_p of dry skin by 14 % and 24 standard errors.
 
-    The score has three standard deviations: one of three is below `DOUBTED`, and 13 of 16 would be
-    so with a probability of 1e-4.
+    The gain is three of its standard errors, and looks like less than `DOUBTED` in four of 16.
     """
     silent = 0
     for number in range(8):

@@ -50,7 +50,10 @@ def code(commit, names):
     """
     found = {}
     for name in names:
-        text = git("show", f"{commit}:{name}").stdout if name.endswith(".py") else ""
+        text = git("show", f"{commit}:{name}").stdout
+        if not name.endswith(".py"):
+            found[text] = name
+            continue
         tree = ast.parse(text)
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
