@@ -36,7 +36,7 @@ NUMBER, LIMIT = 77, 10.0
 OLD, FOUND, FRESH = np.array([1.0, 2.0, 0.1]), np.array([1.1, 2.1, 0.2]), np.array([7.0, 2.2, 0.3])
 BEFORE = np.array([[50.0, 5.0], [5.0, 40.0]])
 TOLD, ALONE = np.array([[30.0, 2.0], [2.0, 20.0]]), np.array([[60.0, 3.0], [3.0, 70.0]])
-SHAPE, NEW_SHAPE = np.array([[3.0, 1.0], [1.0, 2.0]]), np.array([[4.0, -1.0], [-1.0, 2.0]])
+SHAPE = np.array([[3.0, 1.0], [1.0, 2.0]])
 GOOD, BAD, LATE = SUCCESSFUL, RESULTS.misfit, MAX_STEPS_REACHED
 
 
@@ -108,7 +108,7 @@ def electrode(of: Case) -> tuple[Any, ...]:
     measured = MEASURED(
         gain=np.zeros(1, complex),
         variance=1.4,
-        weight=np.zeros(1),
+        weight=np.array([1.5, 0.5]),
         level=1.3,
         amplitude=0.0 if of.silent else 2.0,
         offset=1.25,
@@ -119,10 +119,10 @@ def electrode(of: Case) -> tuple[Any, ...]:
     sums = [[-150.0 if of.gain else 1.0, 90.0, 2.0], [1.0, 1.0, 0.0]]
     scores = SCORES(np.array(sums), np.array([0.5, -8.0]))
     result = GOOD if of.found else BAD
-    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, result, scores, NEW_SHAPE)
+    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, result, scores)
     own = np.array([*(OLD[:2] + 1e-3), 0.3]) if of.near else FRESH
     result = RESULT[of.fresh]
-    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, result, scores, 2 * SHAPE)
+    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, result, scores)
     z = np.array([0.1, 0.2])
     suspected = SUSPICION(of.jump, of.drift, np.array([0.7, 0.8]), 0.02 * BEFORE, 0, z)
     return state, measured, BEFORE, found, fresh, suspected, LIMIT, NUMBER
@@ -145,7 +145,8 @@ def expected(of: Case) -> dict[str, Any]:
     lost = of.running and (missed >= PATIENCE or of.off)
     information, pulses = before, state["pulses"]
     if good:
-        turn = np.linalg.cholesky(used.shape) @ np.linalg.inv(np.linalg.cholesky(state["shape"]))
+        new, old = map(np.linalg.cholesky, (used.information / 2, state["shape"]))
+        turn = new @ np.linalg.inv(old)
         summed = turn @ before @ turn.T + used.information
         information = used.information if again else summed
         pulses = 1 if again else state["pulses"] + 1
@@ -182,7 +183,7 @@ def expected(of: Case) -> dict[str, Any]:
         "shown": [4.0, 5.0],
         "confirmed": confirmed,
         "scores": sums,
-        "shape": used.shape if good else state["shape"],
+        "shape": used.information / 2 if good else state["shape"],  # 2 is the weight
         "mean": mean,
         "mean_cov": mean_cov,
         "event": JUMP if jumped else DRIFT if drifted else NONE,
@@ -519,7 +520,7 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(monkeypatch):
     @jax.jit
     @jax.vmap
     def alone(spread, result):
-        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, scores, two)
+        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, scores)
         monkeypatch.setattr(tick, "attempt", lambda *_: fit)
         return anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two).result
 

@@ -82,7 +82,7 @@ class ElectrodeState(eqx.Module):
             that did not; 0 if there was none.
         scores: Sums of the tests of a gain and of a spread since the electrode began anew,
             `etid.online.alarms.PulseScores.sums`.
-        shape: What the last good pulse tells of the elements, `etid.online.tick.Attempt.shape`.
+        shape: Information of the last good pulse about the elements, for each unit of its weight.
         level: Effective value of the gain of the last pulse; 1 if the electrode is open.
         variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
         chi2: χ² of the last pulse.

@@ -76,8 +76,6 @@ class Attempt(NamedTuple):
         rrse: RRSE of the pulse.
         result: Verdict.
         scores: PulseScores of a gain and of a spread.
-        shape: Information about the elements where this pulse was linearised, of a pulse with the
-            weight of the unloaded record.
     """
 
     own: Float[Array, "*lane own"]
@@ -87,7 +85,6 @@ class Attempt(NamedTuple):
     rrse: Float[Array, "*lane"]
     result: RESULTS
     scores: PulseScores
-    shape: Float[Array, "*lane element element"]
 
 
 class Suspicion(NamedTuple):
@@ -257,8 +254,7 @@ def attempt(
         (~(decrement < SETTLED**2), MAX_STEPS_REACHED),
         (misses(chi2, rrse) & ~noisy | late, RESULTS.misfit),
     )
-    shape = told * (jnp.sum(model.bands.weight) / jnp.sum(measured.weight))
-    return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, scores, shape)
+    return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, scores)
 
 
 def _tracked(
@@ -390,7 +386,8 @@ def after_pulse(
     fits = running & good & ~suspected.jump & ~wrong
     reached = jnp.maximum(state.confirmed, measured.amplitude)
     begun = ~running & (used.result == MAX_STEPS_REACHED)
-    summed = turned(information, state.shape, used.shape) + used.information
+    shape = used.information / jnp.sum(measured.weight)
+    summed = turned(information, state.shape, shape) + used.information
     gained = jnp.where(restarted, used.information, summed)
     followed = good & ~again
     return ElectrodeState(
@@ -403,7 +400,7 @@ def after_pulse(
         shown=jnp.stack([measured.shown, state.shown[0]]),
         confirmed=jnp.where(fits, reached, jnp.where(silent, state.confirmed, 0.0)),
         scores=sums,
-        shape=jnp.where(good, used.shape, state.shape),
+        shape=jnp.where(good, shape, state.shape),
         level=jnp.where(silent, state.level, measured.level),
         variance=jnp.where(silent, state.variance, measured.variance),
         chi2=jnp.where(silent, state.chi2, used.chi2),
