@@ -15,7 +15,7 @@ from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_at
 from etid.online import alarms, tick
-from etid.online.tracker import Tracker
+from etid.online.tracker import BUFFERS, Tracker
 from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, Sampler, SkinLoad, loading
@@ -166,10 +166,11 @@ def test_without_noise_its_bias_is_about_a_tenth_of_the_noise_of_100_pulses_at_6
     fits = tracker.read(tracker.update(start, with_noise(pulses, seed=5)[8]))
     own = np.diagonal(fits.cov - fits.fit.shared_cov, axis1=1, axis2=2)  # noise of a pulse alone
     hundred = np.sqrt(own) / np.asarray(fits.circuit.values()) / 10
-    # Nine, because windows without noise repeat after three: the next is not one of the last two.
-    state = anew(followed(tracker, pulses[:9]))
+    state = start
     for v_out in pulses:
-        state = tracker.update(state, v_out)
+        # Windows without noise repeat after three.
+        lanes = dataclasses.replace(state.electrodes, shown=jnp.full((TEN, BUFFERS), jnp.nan))
+        state = tracker.update(dataclasses.replace(state, electrodes=lanes), v_out)
     found = np.asarray(tracker.read(state).circuit.values())
     # 0.10 of it for R_p of dry skin; the standard error of one pulse scatters by 2 %.
     bias = found / tiled(TRUTH) - 1
@@ -255,7 +256,7 @@ TROUBLES = {
     "clipped": {"saturated"},
     "unplugged": {"flat"},
     "frozen": {"repeated"},
-    "frozen, two buffers in turn": {"repeated"},
+    "frozen, eight buffers in turn": {"repeated"},
 }
 
 
@@ -267,15 +268,15 @@ def test_electrodes_in_trouble_say_so_at_once_and_recover():
     lifted = with_noise(tracker.pulses(quiet()["dry"].v_th), seed=3)
     first, last = 12, 24
     for electrode, trouble in enumerate(TROUBLES):
-        bad, before = pulses[first:last, electrode], pulses[first - 2 : first, electrode]
+        bad, before = pulses[first:last, electrode], pulses[first - BUFFERS : first, electrode]
         bad[:] = {
             "lifted": lifted,
             "turned over": -bad,
             "not a number": np.full_like(bad, np.nan),
             "clipped": np.minimum(4 * bad, HIGHEST),
             "unplugged": 1e-4 * with_noise(np.zeros_like(bad), seed=3),
-            "frozen": before[1],
-            "frozen, two buffers in turn": np.resize(before, bad.shape),
+            "frozen": before[-1],
+            "frozen, eight buffers in turn": np.resize(before, bad.shape),
         }[trouble]
     state = tracker.start()
     for number, v_out in enumerate(pulses):

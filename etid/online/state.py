@@ -77,7 +77,7 @@ class ElectrodeState(eqx.Module):
         amplitude: Amplitude of the last pulse, relative to that of the unloaded record;
             NaN before the first pulse.
         offset: Offset of the converter [V].
-        shown: A number that two different windows never share, of the last two windows.
+        shown: A number that two different windows never share, of the last windows.
         confirmed: Largest amplitude of a pulse that fitted its prediction, since the last pulse
             that did not; 0 if there was none.
         scores: Sums of the tests of a gain and of a spread since the electrode began anew,
@@ -102,7 +102,7 @@ class ElectrodeState(eqx.Module):
     missed: Int[Array, "*lane"]
     amplitude: Float[Array, "*lane"]
     offset: Float[Array, "*lane"]
-    shown: Float[Array, "*lane 2"]
+    shown: Float[Array, "*lane window"]
     confirmed: Float[Array, "*lane"]
     scores: Float[Array, "*lane change 3"]
     shape: Float[Array, "*lane element element"]

@@ -397,7 +397,7 @@ def after_pulse(
         missed=missed,
         amplitude=measured.amplitude,
         offset=measured.offset,
-        shown=jnp.stack([measured.shown, state.shown[0]]),
+        shown=jnp.append(measured.shown, state.shown[:-1]),
         confirmed=jnp.where(fits, reached, jnp.where(silent, state.confirmed, 0.0)),
         scores=sums,
         shape=jnp.where(good, shape, state.shape),

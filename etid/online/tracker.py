@@ -77,6 +77,7 @@ from etid.results.fits import Fits
 from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
 
+BUFFERS = 8  # windows that are remembered: a source with more buffers may return an old one unseen
 # A window has faults that a record of several periods has not, and others have other remedies.
 NOTES = {
     "too_short": "No pulse was identified yet; the elements are typical values, not estimates.",
@@ -218,7 +219,7 @@ class Tracker(Overviewed):
             missed=none,
             amplitude=jnp.zeros(lanes) if at_rest else nan,
             offset=nan,
-            shown=jnp.full((lanes, 2), jnp.nan),
+            shown=jnp.full((lanes, BUFFERS), jnp.nan),
             scores=jnp.zeros((lanes, 2, 3)),
             shape=jnp.zeros((lanes, elements, elements)),
             confirmed=jnp.zeros(lanes),
