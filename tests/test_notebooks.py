@@ -145,9 +145,8 @@ def run_page(path, names, capsys):
     for code, printed in blocks_of(path):
         exec(compile(code, path.name, "exec"), names)
         shown = capsys.readouterr().out
-        if printed:
-            assert structure(shown) == structure(printed)
-            assert not stale(printed, shown)
+        assert structure(shown) == structure(printed)
+        assert not stale(printed, shown)
 
 
 @pytest.fixture(scope="module")

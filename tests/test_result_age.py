@@ -43,9 +43,9 @@ def commits(table):
 
 
 def code(commit, names):
-    """Statements of modules but imports, without docstrings, on which no number depends.
+    """Statements of modules but imports, without docstrings and messages: no number depends on them.
 
-    One that was moved from one module to another is the same, and a new one that is used changes
+    A text with a space is a message; names have none. A statement that was moved from one module to another is the same, and a new one that is used changes
     another.
     """
     found = {}
@@ -59,6 +59,8 @@ def code(commit, names):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
                 if ast.get_docstring(node) is not None:
                     del node.body[0]
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
+                node.value = ""
         for node in tree.body:
             if not isinstance(node, ast.Import | ast.ImportFrom):
                 found[ast.dump(node)] = name

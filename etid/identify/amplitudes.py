@@ -114,7 +114,7 @@ def identify_amplitudes(
 
     Returns:
         Elements, standard errors, verdict, and the remarks on all recordings. χ² and RRSE are those
-        of the worst recording. The verdict is `insensitive` if the error of I_0 exceeds a third of
+        of the worst recording. The verdict is `insensitive` if the error of I_0 exceeds 0.3 of
         it: as far as the recordings show, the load is linear.
 
     Raises:

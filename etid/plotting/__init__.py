@@ -60,10 +60,10 @@ def plot(
     | `plot(fit, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
     | `plot(fit, show="residual")` | residual [mV], its correlations | 3 |
     | `plot(fit)` of `identify_impedance` | Nyquist and Bode: fit, measured | 3 |
-    | `plot(fits[0], recording, driver)` | the same for one of several fits | 2 |
-    | `plot(fits[0], recording)` | the same for a fit from a measured current | 2 |
+    | `plot(fits[0], recording, driver)` | as `plot(fit)`, for one of several fits | 2 |
+    | `plot(fits[0], recording)` | that for a fit from a measured current | 2 |
     | `plot(selection, recording, driver)` | impedance measured, and each candidate | 4 |
-    | `plot(driver, calibration)` | the same two diagrams for the calibration's resistor | 2 |
+    | `plot(driver, calibration)` | as `plot(fit)`, for the resistor of a calibration | 2 |
     | `plot(driver)`, `plot(circuit)` | magnitude [kΩ] and phase [deg] of an impedance | 2 |
     | `plot({label: driver, fit or circuit})` | several of these in one diagram | 2 |
     | `plot(posterior)` | each element, and each two of them, beside the errors of the fit | n² |

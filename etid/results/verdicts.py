@@ -93,7 +93,7 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
     repeated = (
-        "The samples are exactly those of one of the two pulses before. Noise never repeats, so "
+        "The samples are exactly those of one of the last eight pulses. Noise never repeats, so "
         "this buffer was not filled anew. Check the acquisition."
     )
     saturated = (
