@@ -61,7 +61,7 @@ def tried(interpreter, wheel, dependencies, folder):
 
 
 def follow_readme(python, clone):
-    """The example of the README after its `pip install .`: its picture, and the words it prints."""
+    """After the README's `pip install .`: the words and the picture of its example, its commands."""
     text = (ROOT / "README.md").read_text("utf-8")
     section = text.split("## Sixty seconds\n")[1].split("\n## ")[0]
     installed, example, told = re.findall(r"```\w*\n(.*?)```", section, re.DOTALL)
@@ -74,6 +74,9 @@ def follow_readme(python, clone):
     words = [re.sub(r"[\d.]+", "#", of).split() for of in (told, printed)]
     assert words[0] == words[1], printed
     assert (clone / "fit.png").stat().st_size > 10_000
+    for program, *arguments in map(str.split, re.findall("`(etid [^`]*)`", section)):
+        run(python.parent / program, *arguments, cwd=clone, capture_output=True)
+    assert (clone / "fits.html").stat().st_size > 100_000
     print("  the README's sixty seconds: as it says")
 
 

@@ -16,7 +16,7 @@ import shtab
 import etid
 from benchmarks.specimens import study_fits
 from etid import cli
-from etid.commands import calibrate, fit
+from etid.commands import calibrate, fit, simulate
 from etid.simulation.calibration import CheckedCalibration
 
 DONE, WRONG_DATA, WRONG_USAGE = 0, 1, 2
@@ -89,6 +89,13 @@ def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_pat
     assert not np.array_equal(records[0], records[2])
     truth = json.loads((tmp_path / "t.json").read_text())
     assert truth["typical/dry/03"] == {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
+
+
+@pytest.mark.parametrize("preset", ["paper_built", "paper_dry", "paper_damp", "paper_subjects"])
+def test_no_recording_of_the_default_seed_is_refused(preset):
+    """As one good recording in some thousand is by chance: no first sight of etid."""
+    study = etid.scenes.PRESETS[preset]().simulate(simulate.SEED)
+    assert set(etid.identify_study(study).fits.verdicts) == {"successful"}
 
 
 def test_check_names_every_wrong_field(run, study_file):
