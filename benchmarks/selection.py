@@ -35,7 +35,7 @@ from etid.simulation import scenes
 FIRST = 1000  # number of the first driver; those of other benchmarks are smaller
 MAP = Effort(7, 10)  # of a cell of the map
 PAIRS = 15  # timed pairs
-FEWEST = 20  # intervals whose coverage is looked at
+FEWEST = 10  # intervals whose coverage is looked at
 BATCH, SINGLES = 64, 16  # recordings of a pair: at once, and one at a time
 # The same of a quick run, which has every 20th cell of the map.
 FEW, FEW_PAIRS, FEW_DRIVERS, FEW_SNR, STEP = Effort(1, 4), 3, 2, (20, 60), 20
