@@ -184,7 +184,8 @@ def main(arguments: argparse.Namespace) -> bool:
     for name in dict.fromkeys(answer.method for answer in every):
         of = [answer for answer in every if answer.method == name]
         verdicts = collections.Counter(answer.verdict for answer in of)
-        show({"method": name, **rates(of), **verdicts})
+        told = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+        show({"method": name, **rates(of), "verdicts": told})
     for row in failures:
         if row["method"] == DEFAULT:
             place = f"{row['map']}, {row['row']}, {row['column']}"
