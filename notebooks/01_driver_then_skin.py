@@ -21,7 +21,7 @@
 # how to judge the results. It also shows why the Steiglitz-McBride method of the paper gives only a
 # start for a better method.
 #
-# It needs etid and Jupyter (`pip install . jupyterlab`), and takes less than a minute.
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes ten seconds.
 
 # %%
 # %matplotlib inline

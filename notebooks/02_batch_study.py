@@ -20,7 +20,7 @@
 # separates three parts of the spread: differences between people, differences between the trials of
 # one person, and measurement noise. A fourth part, the error of the driver, is in no spread.
 #
-# It needs etid and Jupyter (`pip install . jupyterlab`), and takes some seconds.
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes ten seconds.
 
 # %%
 # %matplotlib inline

@@ -21,7 +21,7 @@
 # etid has both, as `etid.SkinLayers` and `etid.SkinCole`; this is how they are made. You will also
 # know how to see that a circuit is too small, or too large.
 #
-# It needs etid and Jupyter (`pip install . jupyterlab`), and takes less than a minute.
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes ten seconds.
 
 # %%
 # %matplotlib inline

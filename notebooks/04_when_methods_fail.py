@@ -20,7 +20,7 @@
 # the wrong fits look perfect. A residual does not show a wrong circuit, and a small RRSE does not
 # show a right one. Compare the residual with the noise of the record, and read the verdict.
 #
-# It needs etid and Jupyter (`pip install . jupyterlab`), and takes half a minute.
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes twenty seconds.
 
 # %%
 # %matplotlib inline

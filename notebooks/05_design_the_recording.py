@@ -21,7 +21,7 @@
 # pulses, their width, height and rate, the sample rate, and the calibration. At the end a
 # simulation shows that the bound is right.
 #
-# It needs etid and Jupyter (`pip install . jupyterlab`), and takes a minute.
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes twenty seconds.
 
 # %%
 # %matplotlib inline

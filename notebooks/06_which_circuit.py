@@ -20,7 +20,7 @@
 # constants (Cole), and two layers: for one recording, for a study, and for real data whose circuit
 # is known.
 #
-# It needs etid and Jupyter (`pip install . jupyterlab`), and takes about two minutes.
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes a minute.
 
 # %%
 # %matplotlib inline

@@ -19,7 +19,7 @@
 # This notebook closes the loop: pulses are recorded, the skin is identified after each of them, and
 # the amplitude of the next pulse is chosen for a wanted charge. A finger becomes wet meanwhile.
 #
-# It needs etid and Jupyter (`pip install . jupyterlab`), and takes half a minute.
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes ten seconds.
 
 # %%
 # %matplotlib inline
