@@ -6,7 +6,9 @@ Every output on a page comes from the code above it. A notebook becomes the page
 figure.
 """
 
+import concurrent.futures
 import functools
+import os
 import pathlib
 import re
 import time
@@ -58,8 +60,12 @@ def on_config(config):
 @event_priority(50)
 def on_files(files, config):
     """Execute the notebooks and add their pages and figures."""
-    for path in _notebooks():
-        body, figures, taken = executed(path)
+    paths = _notebooks()
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        # The longest is the last.
+        made = dict(zip(reversed(paths), pool.map(executed, reversed(paths)), strict=True))
+    for path in paths:
+        body, figures, taken = made[path]
         log.info("%s: executed in %.0f s", path.name, taken)
         for name, content in figures.items():
             place = f"notebooks/{path.stem}_{name}"

@@ -27,7 +27,7 @@ REST = "recordings"  # the last level: recordings with equal labels
 INTERVAL = 3.84  # increase of −2 ln L at the ends of a 95 % interval
 STEPS, SETTLED = 60, 1e-5  # of the search; the change of −2 ln L where it ends
 RIDGE = 1e-6  # added to the matrix, for deviations that are 0
-END = 0.01  # relative error of the ends of an interval
+END = 1e-4  # relative error of the ends of an interval
 FINE = 1e-6  # of the spread of the logarithms; smaller deviations are 0
 
 
@@ -169,53 +169,93 @@ def _levels(
     return found | ({REST: np.arange(count)} if count > groups else {})
 
 
+class _Inverse(NamedTuple):
+    """V⁻¹ at some standard deviations; see `_Model`.
+
+    Attributes:
+        w: Diagonal of W.
+        kernel: K̄.
+        along: v; V⁻¹1 = W Ū v.
+        total: 1ᵀV⁻¹1.
+        logs: ln |V|.
+    """
+
+    w: np.ndarray
+    kernel: np.ndarray
+    along: np.ndarray
+    total: float
+    logs: float
+
+
 @dataclasses.dataclass(frozen=True)
 class _Model:
     """The restricted likelihood of logarithms.
 
+    Their covariance is V = W⁻¹ + U S² Uᵀ. W is diagonal and has the errors of the fits and the last
+    level, U the other effects, S their standard deviations. With K = S (1 + S UᵀWU S)⁻¹ S
+    (Woodbury), v = (−K UᵀW1, 1) and Ū = (U, 1),
+
+        V⁻¹ = W − W U K UᵀW,    P = V⁻¹ − V⁻¹1 1ᵀV⁻¹ / 1ᵀV⁻¹1 = W − W Ū K̄ ŪᵀW,
+        K̄ = (K, 0; 0, 0) + v vᵀ / 1ᵀV⁻¹1.
+
     Attributes:
         y: Logarithms.
         noise: Their squared errors.
-        levels: Group of each logarithm, by level, numbered from 0.
-        drivers: Errors of the drivers, (logarithm, driver).
+        effects: Ū: groups of all levels but the last, errors of the drivers, 1.
+        level: (effect, level but the last), 1 where the effect is of this level.
         spread: Standard deviation of the logarithms.
     """
 
     y: np.ndarray
     noise: np.ndarray
-    levels: Sequence[np.ndarray]
-    drivers: np.ndarray
+    effects: np.ndarray
+    level: np.ndarray
     spread: float
 
     @classmethod
     def of(
         cls, y: np.ndarray, s: np.ndarray, levels: Sequence[np.ndarray], drivers: np.ndarray
     ) -> "_Model":
+        """The model.
+
+        Args:
+            y: Logarithms.
+            s: Their errors.
+            levels: Group of each logarithm, by level, numbered from 0; in the last level each has a
+                group of its own.
+            drivers: Errors of the drivers, (logarithm, driver).
+        """
         spread = float(np.std(y)) or 1.0
-        return cls(y, s**2 + (FINE * spread) ** 2, levels, drivers, spread)
+        groups = [np.eye(of.max() + 1)[of] for of in levels[:-1]]
+        effects = np.hstack([*groups, drivers, np.ones((y.size, 1))])
+        owner = np.repeat(np.arange(len(groups)), [of.shape[1] for of in groups])
+        level = np.eye(effects.shape[1], owner.size) @ np.eye(len(groups))[owner]
+        return cls(y, s**2 + (FINE * spread) ** 2, effects, level, spread)
 
     def deviance(self, std: np.ndarray) -> float:
         """−2 ln of the restricted likelihood."""
-        return self._parts(std)[0]
+        of = self._inverse(std)
+        return of.logs + float(np.log(of.total) + self.y @ self._projected(of))
 
-    def _parts(self, std: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """The deviance, P = V⁻¹ − V⁻¹1 1ᵀV⁻¹ / 1ᵀV⁻¹1, and V⁻¹1."""
-        inverse, logs = np.zeros((self.y.size, self.y.size)), 0.0
-        for group in range(self.levels[0].max() + 1):  # independent but for the drivers
-            rows = np.flatnonzero(self.levels[0] == group)
-            v = np.diag(self.noise[rows])
-            for one, of in zip(std, self.levels, strict=True):
-                v += one**2 * (of[rows][:, None] == of[rows])
-            logs += float(np.linalg.slogdet(v)[1])
-            inverse[np.ix_(rows, rows)] = np.linalg.inv(v)
-        # (V + A Aᵀ)⁻¹ = V⁻¹ − V⁻¹A (1 + AᵀV⁻¹A)⁻¹ AᵀV⁻¹
-        of = inverse @ self.drivers
-        inner = np.eye(of.shape[1]) + self.drivers.T @ of
-        logs += float(np.linalg.slogdet(inner)[1])
-        inverse -= of @ np.linalg.solve(inner, of.T)
-        ones = inverse.sum(0)
-        p = inverse - np.outer(ones, ones) / ones.sum()
-        return logs + float(np.log(ones.sum()) + self.y @ p @ self.y), p, ones
+    def _inverse(self, std: np.ndarray) -> _Inverse:
+        w = 1 / (self.noise + std[-1] ** 2)
+        gram = self._gram(w)
+        scale = np.where(self.level.any(1), self.level @ std[:-1], 1.0)[:-1]
+        inner = np.eye(scale.size) + scale[:, None] * gram[:-1, :-1] * scale
+        k = scale[:, None] * np.linalg.solve(inner, np.diag(scale))
+        along = np.append(-k @ gram[:-1, -1], 1.0)
+        total = float(along @ gram[:, -1])
+        logs = float(np.linalg.slogdet(inner)[1] - np.sum(np.log(w)))
+        return _Inverse(w, np.pad(k, (0, 1)) + np.outer(along, along) / total, along, total, logs)
+
+    def _gram(self, weight: np.ndarray) -> np.ndarray:
+        """Ūᵀ diag(weight) Ū."""
+        return self.effects.T @ (weight[:, None] * self.effects)
+
+    def _projected(self, of: _Inverse) -> np.ndarray:
+        """P y."""
+        weighted = of.w * (self.y - np.mean(self.y))  # P 1 = 0, but for the digits that it costs
+        return weighted - of.w * (self.effects @ (of.kernel @ (self.effects.T @ weighted)))
 
     def smallest(self, start: np.ndarray, fixed: int | None = None) -> tuple[np.ndarray, float]:
         """Standard deviations with the smallest deviance, by Fisher's scoring of their logarithms.
@@ -240,23 +280,29 @@ class _Model:
     def _derivatives(self, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Slope of the deviance by the ln σ_r, and the expected matrix of its second derivatives.
 
-        By σ_r² they are tr(P M_r) − yᵀP M_r P y and tr(P M_r P M_s), M_r = Z_r Z_rᵀ.
+        By σ_r² they are tr(P M_r) − yᵀP M_r P y and tr(P M_r P M_s), M_r = Z_r Z_rᵀ: sums over the
+        effects of a level, and over the logarithms for the last one.
         """
-        _, p, _ = self._parts(std)
-        columns, along = [_summed(p, of) for of in self.levels], self.y @ p
-        slope = [
-            np.trace(_summed(part.T, of)) - np.sum(np.bincount(of, along) ** 2)
-            for part, of in zip(columns, self.levels, strict=True)
-        ]
-        matrix = [[np.sum(_summed(part.T, of) ** 2) for of in self.levels] for part in columns]
+        of = self._inverse(std)
+        gram, squared, cubed = (self._gram(of.w**power) for power in (1, 2, 3))
+        rest = np.eye(of.along.size) - of.kernel @ gram
+        p, pp = gram @ rest, rest.T @ squared @ rest  # ŪᵀPŪ and ŪᵀPPŪ
+        residual, lost = self._projected(of), of.kernel @ squared
+        own = np.diag(p) - (self.effects.T @ residual) ** 2
+        last = np.sum(of.w) - np.trace(lost) - residual @ residual
+        edge = np.diag(pp) @ self.level
+        corner = np.sum(of.w**2) - 2 * np.sum(of.kernel * cubed) + np.sum(lost * lost.T)
+        matrix = np.block([[self.level.T @ p**2 @ self.level, edge[:, None]], [edge, corner]])
         scale = 2 * std**2
-        return scale * np.array(slope), scale[:, None] * np.array(matrix) * scale
+        slope = scale * np.append(own @ self.level, last)
+        return slope, scale[:, None] * matrix * scale
 
     def fitted(self) -> tuple[Float[np.ndarray, " level"], float, float]:
         """The standard deviations, the mean and its standard error."""
-        best, _ = self.smallest(np.full(len(self.levels), 0.3 * self.spread))
-        _, _, ones = self._parts(best)
-        return best, float(ones @ self.y / ones.sum()), float(1 / np.sqrt(ones.sum()))
+        best, _ = self.smallest(np.full(self.level.shape[1] + 1, 0.3 * self.spread))
+        of = self._inverse(best)
+        mean = float((of.w * self.y) @ (self.effects @ of.along)) / of.total
+        return best, mean, float(1 / np.sqrt(of.total))
 
     def interval(self, row: int, best: np.ndarray) -> tuple[float, float]:
         """The ends of the 95 % interval of one standard deviation."""
@@ -274,10 +320,3 @@ class _Model:
         while beyond(high) < 0:
             high *= 2
         return low, scipy.optimize.root_scalar(beyond, bracket=(at, high), rtol=END).root
-
-
-def _summed(matrix: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Sums of the columns of each group."""
-    order = np.argsort(groups, kind="stable")
-    starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
-    return np.add.reduceat(matrix[:, order], starts, axis=1)
