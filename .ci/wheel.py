@@ -61,7 +61,7 @@ def tried(interpreter, wheel, dependencies, folder):
 
 
 def follow_readme(python, clone):
-    """After the README's `pip install .`: the words and the picture of its example, its commands."""
+    """After the README's `pip install .`: its example with words and picture, and its commands."""
     text = (ROOT / "README.md").read_text("utf-8")
     section = text.split("## Sixty seconds\n")[1].split("\n## ")[0]
     installed, example, told = re.findall(r"```\w*\n(.*?)```", section, re.DOTALL)

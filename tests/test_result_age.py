@@ -43,10 +43,10 @@ def commits(table):
 
 
 def code(commit, names):
-    """Statements of modules but imports, without docstrings and messages: no number depends on them.
+    """Statements of modules but imports, without docstrings and messages.
 
-    A text with a space is a message; names have none. A statement that was moved from one module to another is the same, and a new one that is used changes
-    another.
+    A text with a space is a message; names have none. A statement that was moved from one module to
+    another is the same, and a new one that is used changes another.
     """
     found = {}
     for name in names:

@@ -50,8 +50,10 @@ def dotted(sentence):
     return re.escape(sentence).replace(r"\ ", r"\s+").replace(r"\#", NUMBER)
 
 
+CAP = "In # simulated pulses, # exceeded 120 nC after an unseen change, with up to # µC"
+PAIRS = "about 500 pairs of faults, drawn from different groups (`--pairs 500`)"
 CLAIMS = {
-    ("docs/control.md", "In # simulated pulses, # exceeded 120 nC after an unseen change, with up to # µC"): (
+    ("docs/control.md", CAP): (
         lambda: total("control", "pulses"),
         lambda: total("control", "above_after_unseen_change"),
         lambda: column("control", "largest_of_them_nC").max() / 1000,
@@ -60,7 +62,7 @@ CLAIMS = {
         lambda: total("perturbations", "answers"),
         lambda: total("perturbations", "silent"),
     ),
-    (README, "Of # answers about 500 pairs of faults, drawn from different groups (`--pairs 500`), # are silent"): (
+    (README, f"Of # answers {PAIRS}, # are silent"): (
         lambda: total("perturbation_pairs", "answers"),
         lambda: total("perturbation_pairs", "silent"),
     ),
@@ -87,7 +89,7 @@ CLAIMS = {
         )
         for method in METHODS
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("place", "numbers"), CLAIMS.items(), ids=lambda of: str(of)[:60])
