@@ -174,6 +174,7 @@ class _Inverse(NamedTuple):
 
     Attributes:
         w: Diagonal of W.
+        gram: ŪᵀWŪ.
         kernel: K̄.
         along: v; V⁻¹1 = W Ū v.
         total: 1ᵀV⁻¹1.
@@ -181,6 +182,7 @@ class _Inverse(NamedTuple):
     """
 
     w: np.ndarray
+    gram: np.ndarray
     kernel: np.ndarray
     along: np.ndarray
     total: float
@@ -246,7 +248,8 @@ class _Model:
         along = np.append(-k @ gram[:-1, -1], 1.0)
         total = float(along @ gram[:, -1])
         logs = float(np.linalg.slogdet(inner)[1] - np.sum(np.log(w)))
-        return _Inverse(w, np.pad(k, (0, 1)) + np.outer(along, along) / total, along, total, logs)
+        kernel = np.pad(k, (0, 1)) + np.outer(along, along) / total
+        return _Inverse(w, gram, kernel, along, total, logs)
 
     def _gram(self, weight: np.ndarray) -> np.ndarray:
         """Ūᵀ diag(weight) Ū."""
@@ -284,9 +287,9 @@ class _Model:
         effects of a level, and over the logarithms for the last one.
         """
         of = self._inverse(std)
-        gram, squared, cubed = (self._gram(of.w**power) for power in (1, 2, 3))
-        rest = np.eye(of.along.size) - of.kernel @ gram
-        p, pp = gram @ rest, rest.T @ squared @ rest  # ŪᵀPŪ and ŪᵀPPŪ
+        squared, cubed = self._gram(of.w**2), self._gram(of.w**3)
+        rest = np.eye(of.along.size) - of.kernel @ of.gram
+        p, pp = of.gram @ rest, rest.T @ squared @ rest  # ŪᵀPŪ and ŪᵀPPŪ
         residual, lost = self._projected(of), of.kernel @ squared
         own = np.diag(p) - (self.effects.T @ residual) ** 2
         last = np.sum(of.w) - np.trace(lost) - residual @ residual
