@@ -130,6 +130,20 @@ def test_another_skin_is_a_misfit_where_chi2_does_not_show_it():
     np.testing.assert_allclose(dry.fit.chi2, 1.0, atol=SIGMAS * 0.05)
 
 
+@pytest.mark.parametrize("kind", LOADS)
+def test_skin_of_another_circuit_does_not_move_the_elements_of_the_others(kind):
+    """At 50 dB its χ² is 1.5 at most, and C_p of the others would be several errors off."""
+    odd = Trial("odd", Cole(LOADS[kind], alpha=0.9), condition="odd")
+    study = simulate(odd, seed=4, snr_db=50.0)
+    without = Study.from_recordings([one for one in study.recordings() if one.path != "odd"])
+    fits, alone = (etid.identify_jointly(one).fits for one in (study, without))
+    assert fits.where(path="odd").counts() == {"misfit": 1}
+    others = fits.where(condition="dry")
+    assert others.counts() == {"successful": len(TRIALS)}
+    # Both searches end within 0.01 standard errors of the minimum.
+    np.testing.assert_allclose(off(others), off(alone), atol=0.05)
+
+
 def test_elements_are_within_their_errors_and_spread_by_their_own_part(outcome):
     fits = outcome.fits.where(condition="dry").successful()
     assert (np.abs(off(fits)) < SIGMAS).all()

@@ -48,7 +48,7 @@ def noisy(request):
 
 
 @pytest.mark.parametrize("periods", [1.5, 2.0, 6.0])
-@pytest.mark.parametrize("factor", [1 / 3, 0.5, 0.99, 1.01, 2.0, 3.0])
+@pytest.mark.parametrize("factor", [1 / 3, 0.5, 0.99, 1.01, 2.0, 3.0, 40.0, 60.0, 1000.0])
 def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
     """Half and double distances are no way out; from 1.5 periods on two pulses are there."""
     rate, size = noisy.sample_rate, int(periods * noisy.sample_rate / PULSE) + 1

@@ -97,19 +97,20 @@ class _Start(NamedTuple):
         loads: The loads.
         hum: Whether each recording shows mains hum.
         changed: Whether each recording shows that the driver has changed since its calibration.
+        other: Whether each recording shows another circuit or gain.
     """
 
     loads: Loads
     hum: Bool[Array | np.ndarray, "*lane"]
     changed: Bool[Array | np.ndarray, "*lane"]
+    other: Bool[Array | np.ndarray, "*lane"]
 
 
 def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
     frequency = jnp.asarray(lanes.frequency)[0]
     known = shape_of(driver, frequency)
-    if isinstance(lanes, HarmonicsWithCurrent) or driver.instrument is not None:
-        given = given_driver.given(driver, frequency, model.shared)
-    else:
+    given = uncertain = given_driver.given(driver, frequency, model.shared)
+    if not isinstance(lanes, HarmonicsWithCurrent) and driver.instrument is None:
         given = model.around(model.calibrations.start(), frequency, slopes=False)
 
     def one(lane: Harmonics) -> _Start:
@@ -118,14 +119,14 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
         current = None
         if isinstance(lane, HarmonicsWithCurrent):
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
-        found = fit_alone(model, given, spectrum, sample_rate, starts, current)
-        own, result, chi2, error, hum, errors = found
-        settled = result == optx.RESULTS.successful
-        good = settled & jnp.isfinite(chi2) & ~judgement.misses(chi2, error)
+        found = fit_alone(model, given, uncertain, spectrum, sample_rate, starts, current)
+        settled = found.result == optx.RESULTS.successful
+        good = settled & jnp.isfinite(found.chi2) & ~judgement.misses(found.chi2, found.rrse)
         changed = jnp.array(False) if known is None else known.differs(spectrum)
-        used = good & ~changed
-        loads = Loads(spectrum, sample_rate, own, errors, used, jnp.array(-1), current)
-        return _Start(loads, hum, changed)
+        used = good & ~changed & ~found.other
+        of = found.own, found.errors
+        loads = Loads(spectrum, sample_rate, *of, used, jnp.array(-1), current)
+        return _Start(loads, found.hum, changed, found.other)
 
     return each(one, lanes, count)
 
@@ -245,6 +246,11 @@ class _Group:
     def changed(self) -> list[bool]:
         """Whether each recording shows that the driver has changed since its calibration."""
         return [bool(start.changed) for start in self.starts]
+
+    @property
+    def other(self) -> list[bool]:
+        """Whether each recording shows another circuit or gain."""
+        return [bool(start.other) for start in self.starts]
 
     def several(self) -> list[int]:
         """Checksums of the unloaded records that several recordings share."""
@@ -428,14 +434,17 @@ def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit]
     judged = []
     for group, fit, narrow in zip(groups, found, small, strict=True):
         remarks = np.where(narrow, np.array(group.remarks) | Remark.small_delays, group.remarks)
-        alone = _alone_judged(fit, group.changed)
+        alone = _alone_judged(fit, group.changed, group.other)
         judged.append(concluded(alone, better, remarks.tolist(), group.repeats))
     return judged, better
 
 
-def _alone_judged(fits: Fit, changed: Sequence[bool]) -> Fit:
-    """Fits without remarks on hum; their verdict is `inconsistent` where the driver has changed."""
-    names = fits.verdict
+def _alone_judged(fits: Fit, changed: Sequence[bool], other: Sequence[bool]) -> Fit:
+    """Fits without remarks on hum, with the verdicts of recordings that take no part.
+
+    That is `misfit` for another circuit or gain, and `inconsistent` where the driver has changed.
+    """
+    names = np.where(np.asarray(other) & (fits.verdict == "successful"), "misfit", fits.verdict)
     explained = np.asarray(changed) & np.isin(names, ("successful", "misfit"))
     result = verdicts_of(np.where(explained, "inconsistent", names))
     # The fit of each recording alone decides whether hum is left out.

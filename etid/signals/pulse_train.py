@@ -112,7 +112,8 @@ def pulse_trains(
     """
     size, period = records.shape[1], sample_rate / pulse_rate
     if period > size:
-        period = min(period, sample_rate * pulse_rate)  # pulse_rate may be a period
+        # Both rates may be wrong: pulse_rate may be a period.
+        period = min(float(size), sample_rate * pulse_rate)
     step = _step(period)
     number = size // step
     coarse = records[:, : number * step].reshape(len(records), number, step)

@@ -6,6 +6,7 @@ parallel.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import optimistix as optx
@@ -14,10 +15,32 @@ from jaxtyping import Array, Bool, Float
 from etid.estimators.joint.errors import Found, estimates
 from etid.estimators.joint.near import minimum
 from etid.estimators.joint.terms import Current, Joint, Loads, in_turn
-from etid.estimators.maximum_likelihood import search
+from etid.estimators.maximum_likelihood import load_fit, search
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
+
+
+class Alone(NamedTuple):
+    """What is found of one load alone.
+
+    Attributes:
+        own: Its unknowns.
+        result: Result of the solver.
+        chi2: χ² per degree of freedom.
+        rrse: RRSE.
+        hum: Whether mains hum is seen.
+        other: Whether the record shows another circuit, or another gain of V_out.
+        errors: Errors of the instrument [their standard deviations].
+    """
+
+    own: LoadUnknowns
+    result: optx.RESULTS
+    chi2: Float[Array, ""]
+    rrse: Float[Array, ""]
+    hum: Bool[Array, ""]
+    other: Bool[Array, ""]
+    errors: Float[Array, " error"]
 
 
 def fit_together(
@@ -84,26 +107,24 @@ def _refitted(
 def fit_alone(
     model: Joint,
     driver: GivenDriver,
+    uncertain: GivenDriver,
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
     candidates: LoadUnknowns,
     current: Current | None = None,
-) -> tuple[
-    LoadUnknowns,
-    optx.RESULTS,
-    Float[Array, ""],
-    Float[Array, ""],
-    Bool[Array, ""],
-    Float[Array, " error"],
-]:
-    """Identify the load of one recording from the best of several starts; Z_th is fixed.
+) -> Alone:
+    """Identify the load of one recording from the best of several starts.
 
-    With a current Z_th is not fixed: the three records may know it better than the calibrations,
-    whose error would be a misfit. With an instrument that has tolerances it is not fixed either.
-
-    Returns:
-        The unknowns, the result of the solver, χ² per degree of freedom, RRSE, whether mains hum is
-        seen, and the errors of the instrument.
+    Args:
+        model: The likelihood.
+        driver: The driver of the fit. Z_th may be fixed, but not with a current: the three records
+            may know it better than the calibrations, whose error would be a misfit. With an
+            instrument that has tolerances it is not fixed either.
+        uncertain: The driver with its distribution, of the test for another circuit.
+        spectrum: Harmonics of the recording.
+        sample_rate: Its sampling rate [Hz].
+        candidates: The starts.
+        current: Its measured current.
     """
     lane = model.lane(driver, spectrum, sample_rate, current)
     start = search.best_start(lane, candidates)
@@ -111,5 +132,9 @@ def fit_alone(
     records, profile = lane.known(q), least.near.profile
     chi2 = 2 * least.objective / (lane.terms - start.size)
     error, hum = profile.rrse(records, spectrum.x), profile.shows_hum(records)
-    own = LoadUnknowns.of(q[: start.size], current is not None)
-    return own, least.result, chi2, error, hum, model.calibrations.errors(q)
+    own, z = LoadUnknowns.of(q[: start.size], current is not None), q[start.size :]
+    tested = model.lane(uncertain, spectrum, sample_rate, current)
+    at = jnp.concatenate([own.vector(), z if uncertain is driver else uncertain.mean])
+    scores = load_fit.scores_at(tested, at)
+    other = scores.seen() | scores.has_other_gain()
+    return Alone(own, least.result, chi2, error, hum, other, model.calibrations.errors(q))

@@ -188,11 +188,17 @@ def other_circuit_at(
     z, unit = jnp.zeros(count), jnp.eye(count)
     known = around(calibrations, common, directions, spectrum.frequency, False, z, unit)
     load = Load.behind(known, circuit, Records.of(spectrum), sample_rate)
-    near = load.near(jnp.concatenate([own.vector(), z]))
-    linear, _ = _linear(load, near, near.profile.excess(load.records))
-    rows = near.condensed.rows(changes(load, near))
-    found = _scores(load, near, linear, linear.bread(), rows)
-    return other_circuit.Scores.of(found).seen()
+    return scores_at(load, jnp.concatenate([own.vector(), z])).seen()
+
+
+def scores_at(load: Load, q: Float[Array, " q"]) -> other_circuit.Scores:
+    """What a load shows of another circuit or gain; q need not be at a minimum."""
+    near = load.near(q)
+    linear, _ = _linear(load, near, near.profile.excess(load.known(q)))
+    scales_of_currents = load.gains.outputs - 1
+    tested = changes(load, near)
+    rows = near.condensed.rows(tested[: len(tested) - scales_of_currents])
+    return other_circuit.Scores.of(_scores(load, near, linear, linear.bread(), rows))
 
 
 def _scores(
