@@ -93,6 +93,25 @@ def test_a_profile_and_the_draws_give_one_interval_where_the_likelihood_is_skewe
         assert ends[1] - value > 1.05 * (value - ends[0])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["dry", "damp"])
+def test_at_20_db_intervals_contain_the_truth(kind):
+    """Where R_s + R_p is known and R_s is not, a search in their logarithms finds two thirds."""
+    scene = {"dry": etid.scenes.paper_dry, "damp": etid.scenes.paper_damp}[kind](snr_db=20.0)
+    scene = dataclasses.replace(scene, trials=scene.trials[:1])
+    truth, covered = np.array(dataclasses.astuple(scene.trials[0].load)), []
+    for seed in range(100, 140):
+        study = scene.simulate(seed=seed)
+        driver = etid.identify_driver(study["calibration/98k8"], order=5, throw=False)
+        fit = etid.identify_skin(next(study.loaded.recordings()), driver, throw=False)
+        if fit.verdict == "successful":
+            ends = np.array(list(fit.posterior().intervals().values()))
+            covered.append((ends[:, 0] < truth) & (truth < ends[:, 1]))
+    assert len(covered) > 30
+    # Of 30 intervals of 95 %, less than 24 contain the truth in one of 4 000 tests.
+    assert (np.mean(covered, axis=0) >= 0.8).all(), np.mean(covered, axis=0)
+
+
 def test_the_interval_of_a_parabola_is_that_of_the_normal_distribution():
     values = np.linspace(90e3, 110e3, 41)
     profile = Profile("r_p", "ohm", 100e3, 2e3, values, ((values - 100e3) / 2e3) ** 2)

@@ -1,10 +1,11 @@
 """Importance sampling of a density that is known up to a factor, in several rounds.
 
-The draws come from Student's t. Each draw is weighted by the density over that of its proposal.
-Where the density lies in a curved valley, a few draws have all the weight. Further rounds therefore
-draw from the mean and the covariance of the weighted draws (population Monte Carlo; Cappé, Guillin,
-Marin and Robert 2004). If few draws are effective, their weights are flattened for this: all get a
-power below 1.
+The draws come from Student's t. Where the density lies in a curved valley, a few draws have all the
+weight. Further rounds therefore draw from the mean and the covariance of the weighted draws. If few
+draws are effective, their weights are flattened for this: all get a power below 1. In the end each
+draw of all rounds is weighted by the density over that of the mixture of all proposals (adaptive
+multiple importance sampling; Cornuet, Marin, Mira and Robert 2012). Of one round alone, the draws
+of a proposal that is too narrow would look as good as any.
 """
 
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from jaxtyping import Float
 
 FREEDOM = 30.0  # of Student's t: 16 unknowns; with 8 half of the draws are lost, with ∞ the tails
 ROUNDS = 6  # of draws, at most
-ENOUGH = 0.3  # effective part of the draws that ends the rounds
+ENOUGH = 0.3  # effective draws that end the rounds, in draws of one round
 SEVERAL = 10.0  # effective draws for each parameter, from which a covariance is estimated
 
 
@@ -31,7 +32,7 @@ def drawn(
     draws: int,
     random: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "draw q"], Float[np.ndarray, " draw"]]:
-    """Draws and their weights, of the round with most effective draws.
+    """Draws of all rounds, and their weights; those are NaN if no draw has one.
 
     Args:
         costs: F = −log p of each draw, but for a constant.
@@ -40,27 +41,24 @@ def drawn(
         draws: Number of draws in a round.
         random: Source of the draws.
     """
-    best = np.zeros((draws, mean.size)), np.full(draws, np.nan)
-    most = 0.0
-    for _ in range(ROUNDS):
-        t = random.normal(size=(draws, mean.size))
-        t /= np.sqrt(random.chisquare(FREEDOM, (draws, 1)) / FREEDOM)
-        q = mean + t @ np.linalg.cholesky(cov).T
-        density = -0.5 * (FREEDOM + mean.size) * np.log1p(np.sum(t**2, axis=1) / FREEDOM)
-        log_weight = -costs(q) - density
-        log_weight = np.where(np.isfinite(log_weight), log_weight, -np.inf)
+    q, cost = np.zeros((0, mean.size)), np.zeros(0)
+    weights = np.full(draws, np.nan)
+    proposals = []
+    while len(proposals) < ROUNDS:
+        proposals.append(scipy.stats.multivariate_t(mean, cov, FREEDOM))
+        drawn = proposals[-1].rvs(draws, random_state=random).reshape(draws, mean.size)
+        q, cost = np.concatenate([q, drawn]), np.concatenate([cost, costs(drawn)])
+        mixture = scipy.special.logsumexp([one.logpdf(q) for one in proposals], axis=0)
+        log_weight = np.where(np.isfinite(cost), -cost - mixture, -np.inf)
         weights = scipy.special.softmax(log_weight)
-        found = effective(weights)
-        if found > most:
-            best, most = (q, weights), found
-        if not found < ENOUGH * draws:  # also if no draw has a weight
+        if not effective(weights) < ENOUGH * draws:  # also if no draw has a weight
             break
         flat = _flattened(log_weight, min(SEVERAL * mean.size, ENOUGH * draws))
         mean = flat @ q
         cov = np.cov(q, rowvar=False, aweights=flat)
         if np.linalg.matrix_rank(cov) < mean.size:  # of fewer draws than parameters
             break
-    return best
+    return q, weights
 
 
 def _flattened(log_weight: Float[np.ndarray, " draw"], enough: float) -> Float[np.ndarray, " draw"]:
