@@ -51,10 +51,10 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
 
     The temporary file is in the folder of the target. Its name is new in each call, because several
     processes may write the same file. It has the suffix of the target, because some writers choose
-    the format by the suffix.
+    the format by the suffix. A link stays a link: the file that it leads to is the target.
     """
     name = os.fspath(path)
-    target = pathlib.Path(name)
+    target = pathlib.Path(os.path.realpath(name))
     partial = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}")
     try:
         yield partial
