@@ -227,7 +227,7 @@ OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
     [
         ("fit absent.h5 -o fits.h5", "absent.h5: there is no such file"),
         ("fit garbage.h5 -o fits.h5", "garbage.h5: is not an HDF5 file"),
-        ("fit calibration.h5 -o fits.h5", "no loaded recording"),
+        ("fit calibration.h5 -o f.h5", "calibration.h5: there is no loaded recording. Import one"),
         ("import absent.csv -o out.h5", "absent.csv: there is no such file"),
         ("import table.csv -o out.h5", "v_th, v_out, pulse_rate, scale: are not given"),
         (f"import table.csv -o s.h5 {OPEN}", "v_out: is channel 'open', and so is v_th"),
@@ -251,6 +251,7 @@ OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
         ("report study.h5", "run etid fit first"),
         ("simulate paper_dry -o s.h5 --jitter 5", "below half a pulse period"),
         ("simulate paper_dry -o s.h5 --jitter -1", "must not be negative"),
+        ("simulate paper_dry -o s.h5 --seed -1", "seed is -1; it must not be negative"),
     ],
 )
 def test_an_error_is_one_line_without_a_traceback(
@@ -281,7 +282,8 @@ def test_an_error_is_one_line_without_a_traceback(
         "simulate paper_dry -o new --truth new",
     ],
 )
-def test_no_file_of_a_command_is_replaced_by_another(run, study_file, command):
+def test_no_file_of_a_command_is_replaced_by_another(run, study_file, monkeypatch, command):
+    monkeypatch.chdir(study_file.parent)
     before = study_file.read_bytes()
     named = {"FILE": study_file, "PAGE": study_file.with_suffix(".html")}
     status, _, complaints = run(*(named.get(word, word) for word in command.split()), "--force")
