@@ -14,6 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from tqdm import tqdm
 
 import etid
 from etid.identify import file as streaming
@@ -206,6 +207,15 @@ def test_a_lost_worker_keeps_what_is_done(source, tmp_path):
     part.unlink()
     fit_file(source, target, method=METHOD, resume=True)
     assert len(etid.Fits.read(target)) == COUNT
+
+
+def _has_semaphore():
+    return hasattr(tqdm.get_lock(), "mp_lock")
+
+
+def test_a_worker_that_ctrl_c_ends_leaks_no_semaphore():
+    with streaming.processes(1) as executor:
+        assert not executor.submit(_has_semaphore).result()
 
 
 @pytest.mark.slow

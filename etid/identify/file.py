@@ -24,6 +24,7 @@ import os
 import pathlib
 import shutil
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -97,6 +98,7 @@ def _pin(cores: Any, told: Any, level: int) -> None:
     Ctrl-C reaches this process and its parent. The parent says what was kept, so this process ends
     silently. What it logs is told by the parent, too.
     """
+    tqdm.set_lock(threading.RLock())  # its own holds a semaphore, which Ctrl-C leaks
     LOG.setLevel(level)
     LOG.addHandler(logging.handlers.QueueHandler(told))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
