@@ -2,6 +2,7 @@
 
 import atexit
 import gc
+import io
 import os
 import signal
 import sys
@@ -24,6 +25,7 @@ def main() -> int:
     usual = signal.getsignal(signal.SIGINT)
     if usual is signal.default_int_handler:  # a program in the background ignores the signal
         signal.signal(signal.SIGINT, _end)
+    _open_streams()
     from etid.cli import parser_for, run  # `from etid import cli` would import all layers
 
     commands = parser_for(sys.argv[1:])
@@ -33,6 +35,15 @@ def main() -> int:
     except KeyboardInterrupt:  # before or after the command itself
         print("etid: interrupted", file=sys.stderr)
         return _INTERRUPTED
+
+
+def _open_streams() -> None:
+    """Let every text be printed: in any encoding, and where the stream is closed, to nowhere."""
+    if sys.stderr is None:  # print() would choose stdout
+        sys.stderr = open(os.devnull, "w")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _end(number: int, frame: FrameType | None) -> NoReturn:

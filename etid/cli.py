@@ -82,16 +82,16 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
         Exit status.
     """
     arguments = commands.parse_args(words)
-    source = getattr(arguments, "source", [])
-    read = [one for one in np.ravel([source]) if one.exists()]
-    if any(arguments.target.exists() and one.samefile(arguments.target) for one in read):
-        commands.error(f"{arguments.target} is the file to read; name another file to write")
     from etid.recordings.errors import RecordingError
     from etid.results.fit import IdentificationError
 
     try:
+        _check_names(_files(arguments))
         if "force" in arguments:
-            _check_outputs(arguments.module.outputs(arguments), force=arguments.force)
+            outputs = arguments.module.outputs(arguments)
+            for path in _named_twice(_files(arguments), outputs):
+                commands.error(f"{path} is already a file of this command; name another to write")
+            _check_outputs(outputs, force=arguments.force)
         with _logged() if arguments.verbose else contextlib.nullcontext():
             outcome = arguments.module.run(arguments)
     except (RecordingError, IdentificationError, ValueError, OSError) as error:
@@ -108,6 +108,40 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
     return max(outcome.status, _print(text))
 
 
+def _files(arguments: argparse.Namespace) -> list[pathlib.Path]:
+    """All files that the arguments name, to read or to write."""
+    values = (one if isinstance(one, list) else [one] for one in vars(arguments).values())
+    return [path for paths in values for path in paths if isinstance(path, pathlib.Path)]
+
+
+def _check_names(files: Iterable[pathlib.Path]) -> None:
+    """Raise an error if a name cannot be written into a file or a message."""
+    for path in files:
+        try:
+            str(path).encode()
+        except UnicodeEncodeError:
+            raise ValueError(f"{str(path)!r}: this name is not UTF-8; rename the file") from None
+
+
+def _named_twice(
+    files: Sequence[pathlib.Path], outputs: Iterable[pathlib.Path]
+) -> Iterator[pathlib.Path]:
+    """Files to write that the command also reads, or writes as another one."""
+    for path in outputs:
+        # A command may write a file that no argument names, such as the page beside the fits.
+        others = [one for one in files if one is not path]
+        if any(_same(path, one) for one in others):
+            yield path
+
+
+def _same(one: pathlib.Path, other: pathlib.Path) -> bool:
+    """Whether two paths lead to one file, which need not exist."""
+    try:
+        return one.samefile(other)
+    except OSError:
+        return os.path.realpath(one) == os.path.realpath(other)
+
+
 def _check_outputs(outputs: Mapping[pathlib.Path, tuple[str, ...]], *, force: bool) -> None:
     """Raise an error if a file cannot be written, or would be overwritten.
 
@@ -116,18 +150,27 @@ def _check_outputs(outputs: Mapping[pathlib.Path, tuple[str, ...]], *, force: bo
             known format is always right.
         force: Whether existing files may be replaced.
     """
-    from etid.recordings.replacing import check_ending
+    from etid.recordings.replacing import check_ending, unwritable
 
     for path, endings in outputs.items():
-        if path.is_dir():
-            raise ValueError(f"{path}: this is a folder; name a file")
-        if path.exists() and not path.is_file():  # it would be replaced
-            raise ValueError(f"{path}: this is a device or a pipe; name a file")
-        if not path.absolute().parent.is_dir():
-            raise ValueError(f"{path}: the folder of this file does not exist")
+        try:
+            _check_place(path)
+            exists = path.exists()
+        except OSError as error:  # of a folder that the user may not enter, or a name too long
+            raise unwritable(path, error) from error
         check_ending(path, endings)
-        if path.exists() and not force:
+        if exists and not force:
             raise ValueError(f"{path}: this file exists; add --force to replace it")
+
+
+def _check_place(path: pathlib.Path) -> None:
+    """Raise an error if a file cannot be at a path."""
+    if path.is_dir():
+        raise ValueError(f"{path}: this is a folder; name a file")
+    if path.exists() and not path.is_file():  # it would be replaced
+        raise ValueError(f"{path}: this is a device or a pipe; name a file")
+    if not path.absolute().parent.is_dir():
+        raise ValueError(f"{path}: the folder of this file does not exist")
 
 
 @contextlib.contextmanager
@@ -208,8 +251,7 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         of = importlib.metadata.version  # it searches folders, so not at every start
         versions = f"etid {etid.__version__}, JAX {of('jax')}, NumPy {np.__version__}"
-        print(f"{versions}, Python {platform.python_version()}, {platform.machine()}")
-        parser.exit()
+        parser.exit(_print(f"{versions}, Python {platform.python_version()}, {platform.machine()}"))
 
 
 class _Completion(argparse.Action):
@@ -223,8 +265,7 @@ class _Completion(argparse.Action):
 
             parser.error(f"--completion needs shtab: {install('completion')}")
         _complete_paths(parser, shtab.FILE)
-        print(shtab.complete(parser, shell))
-        parser.exit()
+        parser.exit(_print(shtab.complete(parser, shell)))
 
 
 def _complete_paths(parser: argparse.ArgumentParser, how: Any) -> None:

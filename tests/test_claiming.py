@@ -13,6 +13,7 @@ from benchmarks.specimens import study_fits
 from etid import cli
 from etid.identify import file as streaming
 from etid.recordings import replacing
+from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import claimed
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -78,6 +79,15 @@ def test_other_files_of_a_folder_are_free(tmp_path):
     with claimed(tmp_path / "a.h5"):  # again
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_of_the_user_is_no_lock(tmp_path):
+    lock = tmp_path / "fits.h5.lock"
+    lock.write_text("my keys")
+    with pytest.raises(RecordingError, match=r"fits\.h5\.lock beside it is no lock of etid"):
+        with claimed(tmp_path / "fits.h5"):
+            pass
+    assert lock.read_text() == "my keys"
 
 
 def test_a_lock_that_is_removed_while_it_is_opened_is_made_anew(tmp_path, monkeypatch):

@@ -218,6 +218,7 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, without_d
     assert len(etid.Fits.read(target)) == 23
 
 
+LONG = f"{'a' * 300}.h5"
 OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
 
 
@@ -226,7 +227,7 @@ OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
     [
         ("fit absent.h5 -o fits.h5", "absent.h5: there is no such file"),
         ("fit garbage.h5 -o fits.h5", "garbage.h5: is not an HDF5 file"),
-        ("fit calibration.h5 -o fits.h5", "no loaded recording"),
+        ("fit calibration.h5 -o f.h5", "calibration.h5: there is no loaded recording. Import one"),
         ("import absent.csv -o out.h5", "absent.csv: there is no such file"),
         ("import table.csv -o out.h5", "v_th, v_out, pulse_rate, scale: are not given"),
         (f"import table.csv -o s.h5 {OPEN}", "v_out: is channel 'open', and so is v_th"),
@@ -237,6 +238,9 @@ OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
         ("report fits.h5 -o absent/page.html", "absent/page.html: the folder of"),
         ("export fits.h5 -o absent/t.csv", "absent/t.csv: the folder of this file"),
         ("fit study.h5 -o .", ".: this is a folder"),
+        (f"fit {LONG} -o f.h5", f"{LONG}: cannot be opened (File name too long). Check its name"),
+        (f"fit study.h5 -o {LONG}", f"{LONG}: cannot be written ([Errno 36] File name too long"),
+        ("check caf\udce9.h5", r"'caf\udce9.h5': this name is not UTF-8; rename the file"),
         ("fit study.h5 -o table.csv", "table.csv: the file is not written as .csv; "),
         ("report fits.h5 -o page.pdf", "page.pdf: the file is not written as .pdf; "),
         ("fit study.h5 -o calibration.h5", "this file exists; add --force to replace"),
@@ -247,6 +251,7 @@ OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
         ("report study.h5", "run etid fit first"),
         ("simulate paper_dry -o s.h5 --jitter 5", "below half a pulse period"),
         ("simulate paper_dry -o s.h5 --jitter -1", "must not be negative"),
+        ("simulate paper_dry -o s.h5 --seed -1", "seed is -1; it must not be negative"),
     ],
 )
 def test_an_error_is_one_line_without_a_traceback(
@@ -265,12 +270,25 @@ def test_an_error_is_one_line_without_a_traceback(
     assert (again, as_json(printed)) == ([complaint], error)
 
 
-@pytest.mark.parametrize("command", ["fit", "import"])
-def test_the_file_that_is_read_is_never_replaced(run, study_file, command):
+@pytest.mark.parametrize(
+    "command",
+    [
+        "fit FILE -o FILE",
+        "import FILE -o FILE",
+        "import table.csv --mapping FILE -o FILE",
+        "fit other.h5 --driver FILE -o FILE",
+        "calibrate other.h5 --former FILE -o FILE",
+        "report FILE --recordings PAGE",
+        "simulate paper_dry -o new --truth new",
+    ],
+)
+def test_no_file_of_a_command_is_replaced_by_another(run, study_file, monkeypatch, command):
+    monkeypatch.chdir(study_file.parent)
     before = study_file.read_bytes()
-    status, _, complaints = run(command, study_file, "-o", study_file)
+    named = {"FILE": study_file, "PAGE": study_file.with_suffix(".html")}
+    status, _, complaints = run(*(named.get(word, word) for word in command.split()), "--force")
     assert status == WRONG_USAGE
-    assert "is the file to read; name another file to write" in complaints[-1]
+    assert "is already a file of this command; name another to write" in complaints[-1]
     assert study_file.read_bytes() == before
 
 
@@ -387,12 +405,24 @@ def test_the_program_starts_in_float64_and_knows_its_version(without_driver, tmp
     assert ended.stderr == ""  # no progress bar where there is no terminal
 
 
-def test_a_reader_that_has_gone_is_no_error(tmp_path):
+def test_a_closed_stderr_and_another_encoding_stop_nothing(without_driver, tmp_path):
+    command = 'exec "$0" -m etid fit "$1" -o "$2" --json 2>&-'
+    arguments = ["sh", "-c", command, sys.executable, without_driver, tmp_path / "Ω.h5"]
+    environment = {**os.environ, "PYTHONIOENCODING": "latin-1"}
+    done = subprocess.run(arguments, stdout=subprocess.PIPE, check=False, env=environment)
+    assert json.loads(done.stdout)["target"] == str(tmp_path / "Ω.h5")
+
+
+@pytest.mark.parametrize("arguments", ["check study.h5", "--version", "--completion bash"])
+def test_a_reader_that_has_gone_is_no_error(tmp_path, arguments):
     read, write = os.pipe()
     os.close(read)
     etid.scenes.paper_calibration().simulate(seed=0).write(tmp_path / "study.h5")
-    command = [sys.executable, "-m", "etid", "check", tmp_path / "study.h5"]
-    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, check=False)
+    command = [sys.executable, "-m", "etid", *arguments.split()]
+    path = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        command, stdout=write, stderr=subprocess.PIPE, check=False, cwd=tmp_path, env=path
+    )
     os.close(write)
     assert (done.returncode, done.stderr) == (DONE, b"")
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from etid.recordings import hdf5
+from etid.recordings import hdf5, replacing
 from etid.recordings.fields import SIGNALS
 from etid.recordings.recording import Recording, RecordingError, Samples
 from etid.recordings.study import Study
@@ -349,6 +349,14 @@ def test_files_that_are_none_are_refused(tmp_path):
     for name in ("none.h5", "."):
         with pytest.raises(RecordingError, match="there is no such file"):
             hdf5.read(tmp_path / name)
+
+
+@pytest.mark.skipif(replacing.fcntl is None, reason="this system has no locks of files")
+def test_a_file_that_another_program_writes_is_not_called_damaged(path):
+    with open(path) as held:
+        replacing.fcntl.flock(held, replacing.fcntl.LOCK_EX)
+        with pytest.raises(RecordingError, match=r"another program has opened it.*Close it"):
+            hdf5.read(path)
 
 
 def test_a_truncated_file_is_never_more_than_an_error(path, tmp_path):

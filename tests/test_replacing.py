@@ -5,7 +5,7 @@ import pytest
 import etid
 from benchmarks.specimens import study_fits
 from etid.recordings.recording import RecordingError
-from etid.recordings.replacing import replacing
+from etid.recordings.replacing import replace_text, replacing
 
 
 def test_a_file_is_as_it_was_until_all_is_written(tmp_path):
@@ -17,6 +17,19 @@ def test_a_file_is_as_it_was_until_all_is_written(tmp_path):
         assert partial.suffix == ".csv"
     assert target.read_text() == "after"
     assert [path.name for path in tmp_path.iterdir()] == ["fits.csv"]
+
+
+@pytest.mark.parametrize("existing", [True, False])
+def test_a_link_stays_and_the_file_behind_it_is_written(tmp_path, existing):
+    (tmp_path / "folder").mkdir()
+    behind, link = tmp_path / "folder" / "fits.csv", tmp_path / "link.csv"
+    if existing:
+        behind.write_text("before")
+    link.symlink_to("folder/fits.csv")
+    replace_text(link, "after")
+    assert link.is_symlink()
+    assert behind.read_text() == "after"
+    assert list(behind.parent.iterdir()) == [behind]
 
 
 def test_two_processes_may_write_one_file_at_once(tmp_path):

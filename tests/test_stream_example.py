@@ -120,7 +120,18 @@ def test_a_file_that_cannot_be_played_is_refused(tmp_path, stored, text):
     with h5py.File(tmp_path / "pulses.h5", "w") as file:
         file["other" if stored is None else "v_out"] = 0.0 if stored is None else stored
     with pytest.raises(ValueError, match=text):
-        next(stream.played(tmp_path / "pulses.h5", 2, 200e3, 1.0))
+        stream.played(tmp_path / "pulses.h5", 2, 200e3, 1.0)
+
+
+def test_a_stream_that_is_not_there_is_named(tmp_path):
+    (tmp_path / "pulses.csv").write_text("v_out")
+    with pytest.raises(ValueError, match=r"pulses\.csv: is not an HDF5 file"):
+        stream.played(tmp_path / "pulses.csv", 2, 200e3, 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+    for wrong in (address, "127.0.0.1:99999"):
+        with pytest.raises(ValueError, match=f"{wrong} cannot be reached .*start the stimulator"):
+            stream.connected(wrong)
 
 
 def test_a_header_out_of_step_is_refused():

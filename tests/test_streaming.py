@@ -14,6 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from tqdm import tqdm
 
 import etid
 from etid.identify import file as streaming
@@ -105,6 +106,16 @@ class Same(etid.SkinRC):
     """Other elements, with the same typical values."""
 
 
+def edited(factor):
+    """A circuit that its user edits between two runs."""
+
+    class Edited(etid.SkinRC):
+        def impedance(self):
+            return etid.resistor(self.r_s * factor)
+
+    return Edited()
+
+
 def test_a_run_of_other_settings_is_not_resumed(source, tmp_path, monkeypatch):
     target = tmp_path / "fits.h5"
 
@@ -115,7 +126,7 @@ def test_a_run_of_other_settings_is_not_resumed(source, tmp_path, monkeypatch):
         patched.setattr(streaming, "identify_part", fail)
         with pytest.raises(KeyboardInterrupt):
             fit_file(source, target, method=METHOD, order=4)
-    with pytest.raises(ResumeError, match="another order"):
+    with pytest.raises(ResumeError, match="another order; start again with --force in place of"):
         fit_file(source, target, method=METHOD, resume=True)
     for circuit, what in ((Same(), "circuit"), (etid.SkinRC(r_s=10e3), "start")):
         with pytest.raises(ResumeError, match=f"another {what};"):
@@ -125,6 +136,30 @@ def test_a_run_of_other_settings_is_not_resumed(source, tmp_path, monkeypatch):
         fit_file(source, target, method=METHOD, order=4, resume=True)
     fit_file(source, target, method=METHOD)  # anew
     assert etid.Fits.read(target).counts()
+
+
+def test_parts_of_a_circuit_that_was_edited_are_not_kept(source, tmp_path, monkeypatch):
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(streaming, "identify_part", fail)
+    for factor, end in ((1.0, KeyboardInterrupt), (1.0, KeyboardInterrupt), (2.0, ResumeError)):
+        with pytest.raises(end, match="another circuit" if end is ResumeError else None):
+            fit_file(source, tmp_path / "fits.h5", circuit=edited(factor), resume=True)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize(
+    "contents", [{"thesis.txt": "x"}, {"000000.h5": "x"}, {"run.json": "[]"}, {"run.json": "{"}]
+)
+def test_a_folder_that_holds_no_parts_is_left_alone(source, tmp_path, contents, resume):
+    folder = tmp_path / "fits.h5.parts"
+    folder.mkdir()
+    for name, text in contents.items():
+        (folder / name).write_text(text)
+    with pytest.raises(ResumeError, match=r"run\.json: is missing or damaged.*move or delete"):
+        fit_file(source, tmp_path / "fits.h5", method=METHOD, resume=resume)
+    assert {one.name: one.read_text() for one in folder.iterdir()} == contents
 
 
 RUN = """
@@ -163,10 +198,24 @@ def test_a_lost_worker_keeps_what_is_done(source, tmp_path):
             return future
 
     target = tmp_path / "fits.h5"
-    with pytest.raises(ResumeError, match="go on with resume"):
+    with pytest.raises(ResumeError, match="go on with --resume"):
         fit_file(source, target, method=METHOD, executor=Broken())
+    part = tmp_path / "fits.h5.parts" / "000001.h5"
+    part.write_bytes(b"torn")
+    with pytest.raises(etid.RecordingError, match=r"000001\.h5.*Delete this part, and go on with"):
+        fit_file(source, target, method=METHOD, resume=True)
+    part.unlink()
     fit_file(source, target, method=METHOD, resume=True)
     assert len(etid.Fits.read(target)) == COUNT
+
+
+def _has_semaphore():
+    return hasattr(tqdm.get_lock(), "mp_lock")
+
+
+def test_a_worker_that_ctrl_c_ends_leaks_no_semaphore():
+    with streaming.processes(1) as executor:
+        assert not executor.submit(_has_semaphore).result()
 
 
 @pytest.mark.slow

@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         for name, value in vars(arguments).items()
         if name in (*CHANNELS, *FIELDS, *DIALECT)
     }
-    folder = arguments.source[0].is_dir() and arguments.mapping is None
+    folder = os.path.isdir(arguments.source[0]) and arguments.mapping is None
     if folder or arguments.labels:
         return _folder(arguments, given)
     calibrations: dict[str | os.PathLike[str], float] = {

@@ -24,12 +24,15 @@ import os
 import pathlib
 import shutil
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 from tqdm import tqdm
 
+from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.lookup import class_path
 from etid.estimators.registry import Method
 from etid.identify.options import Circuit, Interval, Options, candidates_of
@@ -45,6 +48,8 @@ from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 
 PART = 256  # recordings, some seconds of work; a killed run loses at most one part
+RUN, SIZE = "run.json", "size of a part"  # what describes a run, and a key of it
+CONTINUE = "go on with --resume (in Python: resume=True)"
 
 
 class ResumeError(ValueError):
@@ -93,6 +98,7 @@ def _pin(cores: Any, told: Any, level: int) -> None:
     Ctrl-C reaches this process and its parent. The parent says what was kept, so this process ends
     silently. What it logs is told by the parent, too.
     """
+    tqdm.set_lock(threading.RLock())  # its own holds a semaphore, which Ctrl-C leaks
     LOG.setLevel(level)
     LOG.addHandler(logging.handlers.QueueHandler(told))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -133,39 +139,74 @@ class _Parts:
 
     def __init__(self, target: pathlib.Path, run: Mapping[str, Any], resume: bool) -> None:
         self.folder = _folder(target)
-        described = self.folder / "run.json"
-        if self.folder.exists() and not resume:
+        before = _described(self.folder)
+        if before and not resume:
             shutil.rmtree(self.folder)
+        elif before and (changed := sorted(name for name in run if before.get(name) != run[name])):
+            raise ResumeError(
+                f"{self.folder}: the earlier run had another {' and '.join(changed)}; start again "
+                "with --force in place of --resume (in Python: without resume)"
+            )
         self.folder.mkdir(exist_ok=True)
-        if described.exists():
-            before = json.loads(described.read_text("utf-8"))
-            changed = sorted(name for name in run if before.get(name) != run[name])
-            if changed:
-                raise ResumeError(
-                    f"{self.folder}: the earlier run had another {' and '.join(changed)}; "
-                    "leave out resume to start again"
-                )
-        replace_text(described, json.dumps(run))
+        replace_text(self.folder / RUN, json.dumps(run))
 
     def path(self, number: int) -> pathlib.Path:
         """File of one part."""
         return self.folder / f"{number:06d}.h5"
+
+    def read(self, number: int, circuit: type[AbstractCircuit]) -> StudyFits:
+        """The fits of one part."""
+        try:
+            return StudyFits.read(self.path(number), circuit)
+        except RecordingError as error:
+            raise RecordingError(
+                error.message,
+                file=str(self.path(number)),
+                remedy=f"Delete this part, and {CONTINUE}",
+            ) from error
 
 
 def kept(target: str | os.PathLike[str]) -> str:
     """A sentence on what an unfinished run has kept beside its result; empty if nothing."""
     folder = _folder(pathlib.Path(target))
     try:
-        run = json.loads((folder / "run.json").read_text("utf-8"))
-        total, size = int(run["recordings"]), int(run["size of a part"])
+        run = _described(folder)
+        total, size = int(run["recordings"]), int(run[SIZE])
     except (OSError, ValueError, KeyError, TypeError):
         return ""
     done = min(total, size * len(list(folder.glob("[0-9]*.h5"))))
     return f"{done} of {total} recordings are fitted and kept in {folder}" if done else ""
 
 
+def _described(folder: pathlib.Path) -> dict[str, Any]:
+    """The run whose parts are in a folder; empty if there is no folder, or nothing in it.
+
+    Raises:
+        ResumeError: The folder holds something else.
+    """
+    if not folder.exists() or not any(folder.iterdir()):
+        return {}
+    try:
+        run = json.loads((folder / RUN).read_text("utf-8"))
+    except (OSError, ValueError):
+        run = None
+    if isinstance(run, dict) and SIZE in run:
+        return run
+    raise ResumeError(
+        f"{folder / RUN}: is missing or damaged, so that the folder may hold other things than "
+        "parts of fits; move or delete the folder, or name another file of fits"
+    )
+
+
 def _folder(target: pathlib.Path) -> pathlib.Path:
     return target.with_name(target.name + ".parts")
+
+
+def _told(circuit: AbstractCircuit) -> str:
+    """A circuit as a text: its class, and some numbers that another impedance would not give."""
+    some = type(circuit)(*np.exp(np.linspace(-1, 1, len(circuit.names()))))
+    numbers = " ".join(f"{one:.6g}" for one in np.asarray(some.response(np.geomspace(0.01, 1, 5))))
+    return f"{class_path(type(circuit))} {eqx.tree_pformat(circuit)} {numbers}"
 
 
 @in_float64
@@ -210,8 +251,8 @@ def fit_file(
         of their calibrations.
 
     Raises:
-        ResumeError: The earlier run had other settings, the source has changed since, or a worker
-            was lost.
+        ResumeError: The earlier run had other settings, the source has changed since,
+            `target.parts` holds other things than parts, or a worker was lost.
         RecordingError: The source as a whole is missing, damaged or of another schema, `driver`
             has calibrations of no driver or of several, or another process is writing the target.
         ValueError: The source has no loaded recording.
@@ -241,12 +282,8 @@ def fit_file(
         run = {
             **{name.replace("_", " "): value for name, value in described.items()},
             "source date": list(stamps),
-            "circuit": hashlib.sha256(
-                " ".join(
-                    f"{class_path(type(one))} {eqx.tree_pformat(one)}" for one in options.circuits
-                ).encode()
-            ).hexdigest(),
-            "size of a part": PART,
+            "circuit": hashlib.sha256(" ".join(map(_told, options.circuits)).encode()).hexdigest(),
+            SIZE: PART,
         }
         parts = _Parts(target, run, resume)
         left = [number for number in numbers if not parts.path(number).exists()]
@@ -261,7 +298,7 @@ def fit_file(
                 identified |= found.drivers
                 bar.update(len(found.fits))
         whole = StudyFits.concatenate(
-            StudyFits.read(parts.path(number), type(options.circuit)) for number in numbers
+            parts.read(number, type(options.circuit)) for number in numbers
         )
         whole.write(target)
         shutil.rmtree(parts.folder)
@@ -283,7 +320,7 @@ def _results(
         for future in concurrent.futures.as_completed(futures):
             yield futures.pop(future), future.result()
     except concurrent.futures.BrokenExecutor as error:
-        raise ResumeError("a worker was lost; what is done is kept, go on with resume") from error
+        raise ResumeError(f"a worker was lost; what is done is kept, {CONTINUE}") from error
     finally:
         for future in futures:  # after an interruption the executor would finish the others first
             future.cancel()

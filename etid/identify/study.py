@@ -147,11 +147,15 @@ class Drivers:
         """Paths of all loaded recordings, then of all recordings that cannot be read.
 
         Raises:
-            ValueError: There is none.
+            RecordingError: There is none.
         """
         if paths := [*self.study.loaded, *self.study.problems]:
             return paths
-        raise ValueError("the study has no loaded recording")
+        raise RecordingError(
+            "there is no loaded recording",
+            file=self.study.file,
+            remedy="Import one, or merge its file with this one: etid import, etid merge",
+        )
 
     def loader(self, paths: Sequence[str]) -> Load:
         """A function that reads the recordings of these paths, as in `fed`."""

@@ -14,6 +14,9 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
+from etid.recordings.errors import RecordingError
+from etid.recordings.untrusted import guarded
+
 BLOCK = 500  # samples of a block that is played back
 GAP = 60  # lost pulses in a row that are given to the tracker one by one
 LARGEST = 10**8  # voltages in a block; a header that says more is out of step
@@ -32,23 +35,37 @@ def played(
         speed: 1 for real time.
 
     Raises:
-        ValueError: The speed is not positive, or the file does not hold such a dataset.
+        ValueError: The speed is not positive.
+        RecordingError: The file cannot be read, or does not hold such a dataset.
     """
     if not speed > 0:
         raise ValueError(f"speed is {speed}; it must be positive")
-    with h5py.File(path, "r") as file:
+    with guarded(name := os.fspath(path)) as file:
         v_out = file.get("v_out")
         if not isinstance(v_out, h5py.Dataset):
-            raise ValueError(f"{path} has no dataset v_out; store the voltages there")
-        if v_out.ndim != 2 or v_out.shape[0] != electrodes or v_out.dtype.kind != "f":
-            raise ValueError(
-                f"{path}, v_out: is {v_out.dtype} of shape {v_out.shape}; store volts as floats "
-                f"(electrode, sample), of {electrodes} electrodes as the display has"
+            raise RecordingError(
+                "has no dataset v_out", file=name, remedy="Store the voltages there"
             )
+        if v_out.ndim != 2 or v_out.shape[0] != electrodes or v_out.dtype.kind != "f":
+            raise RecordingError(
+                f"is {v_out.dtype} of shape {v_out.shape}",
+                file=name,
+                field="v_out",
+                remedy="Store volts as floats (electrode, sample), "
+                f"of {electrodes} electrodes as the display has",
+            )
+    return _paced(name, sample_rate * speed)
+
+
+def _paced(path: str, rate: float) -> Iterator[Block]:
+    """Blocks of a file, as many samples a second as told [Hz]."""
+    with h5py.File(path, "r") as file:
+        v_out = file["v_out"]
+        assert isinstance(v_out, h5py.Dataset)
         begin = time.monotonic()
         for first in range(0, v_out.shape[1], BLOCK):
             block = v_out[:, first : first + BLOCK]
-            due = begin + (first + block.shape[1]) / sample_rate / speed
+            due = begin + (first + block.shape[1]) / rate
             time.sleep(max(0.0, due - time.monotonic()))
             yield first, block
 
@@ -57,13 +74,17 @@ def connected(address: str) -> socket.socket:
     """A connection to a server of blocks.
 
     Raises:
-        ValueError: The address is not `host:port`.
-        OSError: Nothing listens there.
+        ValueError: The address is not `host:port`, or nothing listens there.
     """
     host, _, port = address.rpartition(":")
     if not (host and port.isdigit()):
         raise ValueError(f"the address is {address!r}; write host:port")
-    line = socket.create_connection((host, int(port)))
+    try:
+        line = socket.create_connection((host, int(port)))
+    except (OSError, OverflowError) as error:
+        raise ValueError(
+            f"{address} cannot be reached ({error}); start the stimulator, or correct the address"
+        ) from error
     line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # amplitudes leave at once
     return line
 

@@ -4,6 +4,7 @@ import contextlib
 import difflib
 import importlib
 import os
+import stat
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -48,9 +49,20 @@ class RecordingError(ValueError):
 
 
 def require_file(path: str) -> None:
-    """Raise an error if a path is not a file; pipes and devices are not opened."""
-    if not os.path.isfile(path):
-        raise RecordingError("there is no such file", file=path, remedy="Check the path")
+    """Raise an error if a path is not a file that can be read; pipes and devices are not opened."""
+    try:
+        if stat.S_ISREG(os.stat(path).st_mode):
+            with open(path, "rb"):
+                return
+    except (FileNotFoundError, NotADirectoryError):
+        pass  # as for a folder and a pipe
+    except OSError as error:
+        raise RecordingError(
+            f"cannot be opened ({error.strerror})",
+            file=path,
+            remedy="Check its name, and the permissions of the file and of its folders",
+        ) from error
+    raise RecordingError("there is no such file", file=path, remedy="Check the path")
 
 
 def not_recorded(path: str, field: str, remedy: str) -> RecordingError:

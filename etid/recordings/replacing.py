@@ -18,6 +18,7 @@ except ImportError:  # Windows
     fcntl = None
 
 HDF5 = (".h5", ".hdf5", ".hdf")
+OWNER = "process "  # the first word in a lock, before its number
 
 
 def check_ending(path: str | os.PathLike[str], endings: tuple[str, ...] = HDF5) -> None:
@@ -50,10 +51,10 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
 
     The temporary file is in the folder of the target. Its name is new in each call, because several
     processes may write the same file. It has the suffix of the target, because some writers choose
-    the format by the suffix.
+    the format by the suffix. A link stays a link: the file that it leads to is the target.
     """
     name = os.fspath(path)
-    target = pathlib.Path(name)
+    target = pathlib.Path(os.path.realpath(name))
     partial = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}")
     try:
         yield partial
@@ -99,9 +100,18 @@ def claimed(path: str | os.PathLike[str]) -> Iterator[None]:
     target = pathlib.Path(path)
     lock = target.with_name(f"{target.name}.lock")
     held = _locked(lock, target)
+    before = os.read(held, len(OWNER))
+    if before not in (b"", OWNER.encode()):
+        os.close(held)
+        raise RecordingError(
+            f"{lock.name} beside it is no lock of etid",
+            file=str(target),
+            remedy="Move or rename that file, or name another file to write",
+        )
     with contextlib.suppress(OSError):  # on a full disk the lock holds, but names nobody
         os.truncate(held, 0)
-        os.write(held, f"process {os.getpid()} on {platform.node()}".encode())
+        os.lseek(held, 0, os.SEEK_SET)
+        os.write(held, f"{OWNER}{os.getpid()} on {platform.node()}".encode())
     try:
         yield
     finally:

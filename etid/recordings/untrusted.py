@@ -45,6 +45,14 @@ translated = functools.partial(
     located, foreign=Exception, message="the HDF5 library cannot read it", remedy=DAMAGED
 )
 
+# In such a block: the library refuses a file that is being written.
+_unlocked = functools.partial(
+    located,
+    foreign=BlockingIOError,
+    message="another program has opened it to write",
+    remedy="Close it there",
+)
+
 
 class Guarded(io.FileIO):
     """A file for the HDF5 library that refuses a damaged global heap, and texts that are too long.
@@ -123,7 +131,7 @@ def guarded(path: str, **options: Any) -> Iterator[h5py.File]:
             file=path,
             remedy="If it has another format, convert it with `etid import`",
         )
-    with translated(path), contextlib.ExitStack() as stack:
+    with translated(path), _unlocked(path), contextlib.ExitStack() as stack:
         raw = stack.enter_context(Guarded(path, "rb"))
         _check_numbers(raw)
         file = stack.enter_context(h5py.File(raw, "r", **options))

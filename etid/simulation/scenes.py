@@ -219,6 +219,8 @@ class Scene:
         Returns:
             A study with one recording for each calibration and trial.
         """
+        if seed < 0:
+            raise ValueError(f"seed is {seed}; it must not be negative")
         sampler, _, _, sigma = self._exact()
         v_th = voltage(Trial("unloaded", OpenLoad()), sampler.f)
         resistances = {
