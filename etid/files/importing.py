@@ -105,7 +105,7 @@ def import_file(
     """
     single = isinstance(source, str | os.PathLike)
     paths = [pathlib.Path(os.fspath(one)) for one in ([source] if single else source)]
-    known = {pathlib.Path(os.fspath(one)): r for one, r in (calibrations or {}).items()}
+    known = resistors((calibrations or {}).items())
     paths = [*known, *(path for path in paths if path not in known)]  # loaded ones name the others
     given = {name: value for name, value in given.items() if value is not None}
     complete = None
@@ -141,6 +141,28 @@ def import_file(
             names = [path.name for path in paths]
         tables = of_files(content, names)
     return converted(dict(zip(paths, tables, strict=True)), target, place=place, by="mapping")
+
+
+def resistors(
+    calibrations: Iterable[tuple[str | os.PathLike[str], float]],
+) -> dict[str | os.PathLike[str], float]:
+    """The known resistor of each file of calibrations [ohm].
+
+    Raises:
+        RecordingError: A file occurs twice.
+    """
+    known: dict[str | os.PathLike[str], float] = {}
+    for one, r_load in calibrations:
+        path = pathlib.Path(os.fspath(one))
+        if path in known:
+            raise RecordingError(
+                f"is given with two resistors, {known[path]} and {r_load} ohm",
+                file=str(path),
+                field="calibrations",
+                remedy="Give each file once, with the resistor with which it was recorded",
+            )
+        known[path] = r_load
+    return known
 
 
 def channels_of(given: Mapping[str, Any]) -> dict[str, Any]:
