@@ -127,6 +127,11 @@ def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
     assert recording.sample_rate == pytest.approx(RATE)
     [recording], _ = imported(tmp_path / "a.xlsx", v_th="second/open", v_out="open", time="t")
     np.testing.assert_allclose(recording.v_th, 2 * th)
+    book["second"].insert_rows(2)
+    book["second"]["A2"] = "(mV)"
+    book.save(tmp_path / "a.xlsx")
+    [recording], _ = imported(tmp_path / "a.xlsx", v_th="second/open", v_out="open", time="t")
+    np.testing.assert_allclose(recording.v_th, 2e-3 * th)
 
 
 def test_arrays_of_an_npz_file_are_channels(tmp_path):
