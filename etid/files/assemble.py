@@ -241,7 +241,7 @@ def _used(name: str, signal: Signal, said: str, by: str) -> tuple[Used, float]:
         raise RecordingError(
             f"the file says {said!r} {where}, which is neither volts, amperes nor seconds",
             field=field,
-            remedy="Correct it in the file",
+            remedy="Correct it in the file, as in mV, uA or ms",
         )
     if ours and theirs and ours != theirs:
         raise RecordingError(
