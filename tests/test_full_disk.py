@@ -82,7 +82,7 @@ def on_disk_of():
         ("export", "out.csv", (0, 0.5)),
         ("export", "out.parquet", (0, 0.5, 0.999)),
         ("export", "out.cir", (0.5,)),
-        ("export", "out.nwb", (0, 0.3, 0.9, 0.999)),
+        ("export", "out.nwb", (0, 0.3, 0.5, 0.9, 0.999)),
     ],
 )
 def test_a_full_disk_ends_a_command_in_one_line_and_changes_no_file(
