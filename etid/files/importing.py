@@ -68,7 +68,7 @@ def import_file(
 
     With `split`, one long record becomes several trials: `"pulses"` splits it at the pauses between
     its pulses, the name of a trigger channel at the rising edges of the trigger. Files of
-    `calibrations` are not split.
+    `calibrations` are not split, and get none of the electrodes of the parts.
 
     A channel may be in another file, as when V_th was recorded once for all trials: `FILE:NAME` is
     channel `NAME` of `FILE`, a path from the current folder.
@@ -121,7 +121,8 @@ def import_file(
         return converted({paths[0]: own}, target, by="file")
     if mapping is None:
         common = channels_of(given)
-        whole = {name: value for name, value in common.items() if name != "split"}
+        turns = ("split", "electrode") if "split" in common else ()
+        whole = {name: value for name, value in common.items() if name not in turns}
         named = {"calibration": [f"{KINDS[1]}/{path.stem}" for path in known]} if known else {}
         said = {
             path: whole | {"r_load": known[path]} if path in known else common | named
