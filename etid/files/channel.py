@@ -14,6 +14,7 @@ import numpy as np
 
 from etid.recordings import errors, limits
 from etid.recordings.errors import RecordingError
+from etid.recordings.replacing import unwritable
 
 BLOCK = 1 << 20  # [samples] size of a block in memory, 8 MB of real numbers
 
@@ -173,19 +174,29 @@ def spooled(
     """
     files: dict[str, BinaryIO] = {}
     notice = ""
-    with contextlib.ExitStack() as stack:
+    with _written_in(folder), contextlib.ExitStack() as stack:
 
         def prepare(wanted: Iterable[str]) -> None:
             nonlocal notice
-            for name in wanted:
-                files[name] = stack.enter_context(tempfile.TemporaryFile(dir=folder))
-            notice = write(files)
+            with _written_in(folder):
+                for name in wanted:
+                    files[name] = stack.enter_context(tempfile.TemporaryFile(dir=folder))
+                notice = write(files)
 
         def channel(name: str) -> Channel:
             numbers = np.memmap(files[name], np.float64, "r")
             return array_channel(name, numbers, notice=notice, **about(name))
 
         yield Contents(tuple(names), channel, prepare)
+
+
+@contextlib.contextmanager
+def _written_in(folder: pathlib.Path) -> Iterator[None]:
+    """Name the folder, not the file that is read, if temporary files cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(folder, error) from error
 
 
 def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
