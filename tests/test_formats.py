@@ -239,7 +239,7 @@ def test_v_th_may_be_a_channel_of_another_file(tmp_path, monkeypatch):
     wrong = columns("open.csv:b", "skin", sample_rate=2e5)
     refused(finger, wrong, "the names are 'skin', 'open.csv:a'")
     pathlib.Path("open.csv").write_text("a\n1\n2\nx\n", encoding="utf-8")
-    with pytest.raises(RecordingError, match=r"^open\.csv: cannot be read"):
+    with pytest.raises(RecordingError, match=r"^open\.csv: line 4 has 'x'"):
         etid.import_file(finger, "t.h5", told)
 
 
