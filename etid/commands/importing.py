@@ -107,7 +107,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
         return _folder(arguments, given)
     calibrations = resistors((file, _ohm(file, text)) for file, text in arguments.calibrations)
     used = import_file(
-        arguments.source, arguments.target, arguments.mapping, calibrations=calibrations, **given
+        arguments.source,
+        arguments.target,
+        arguments.mapping,
+        calibrations={**calibrations},
+        **given,
     )
     data = {
         "source": [*arguments.source, *calibrations],

@@ -146,13 +146,13 @@ def import_file(
 
 def resistors(
     calibrations: Iterable[tuple[str | os.PathLike[str], float]],
-) -> dict[str | os.PathLike[str], float]:
+) -> dict[pathlib.Path, float]:
     """The known resistor of each file of calibrations [ohm].
 
     Raises:
         RecordingError: A file occurs twice.
     """
-    known: dict[str | os.PathLike[str], float] = {}
+    known: dict[pathlib.Path, float] = {}
     for one, r_load in calibrations:
         path = pathlib.Path(os.fspath(one))
         if path in known:

@@ -321,8 +321,8 @@ def _refuse_other_drivers(studies: Collection[Study]) -> None:
                     "has no calibration, and those of the other files may be of another driver",
                     file=study.file,
                     path=path,
-                    remedy="Merge it with files without calibrations, or import it with its own: "
-                    "etid import --calibration FILE OHM",
+                    remedy="Import it with its own, etid import --calibration FILE OHM, or fit its "
+                    "file alone, with the driver of another: etid fit --driver FILE",
                 )
 
 
