@@ -113,7 +113,7 @@ in `loaded/finger`.
 | `.xlsx` | columns; further sheets `sheet/column` | units as in CSV | none | `.[excel]` |
 
 A table contains its rate if a preamble of an oscilloscope has a `Sample Interval` or an
-`Increment`. In all formats a name such as `open [mV]` contains a unit.
+`Increment`. In all formats a name such as `open [mV]`, `open (mV)` or `open / mV` contains a unit.
 
 The import keeps only a part of a record in memory. MATLAB files before version 7.3, `.npz` files
 and records that are split are the exceptions. Integer codes stay integers if a straight line

@@ -123,6 +123,16 @@ def test_the_command_writes_a_driver_and_a_picture(study, today, tmp_path, capsy
     assert "holds no recording with a known resistor" in capsys.readouterr().err
 
 
+def test_calibrations_that_are_given_twice_are_named_by_their_files(study, tmp_path, capsys):
+    files = [tmp_path / "a.h5", tmp_path / "b.h5"]
+    for file in files:
+        study.write(file)
+    assert main(["calibrate", *map(str, files), "-o", str(tmp_path / "driver.h5")]) == 1
+    place = "{}:calibration/98k8".format
+    words = f"{place(files[1])}: has the same samples as {place(files[0])}. Pass each"
+    assert words in capsys.readouterr().err
+
+
 def test_a_driver_is_written_with_its_calibrations_and_read_again(study, tmp_path):
     calibration = study["calibration/98k8"]
     driver = etid.identify_driver(calibration, method="equation_error", throw=False)

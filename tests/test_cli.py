@@ -220,6 +220,7 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, without_d
 
 LONG = f"{'a' * 300}.h5"
 OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
+TWICE = "--calibration c.csv 1 --calibration c.csv 2"
 
 
 @pytest.mark.parametrize(
@@ -231,6 +232,7 @@ OPEN = "--v-th open --v-out open --scale 1 --pulse-rate 60 --sample-rate 2e5"
         ("import absent.csv -o out.h5", "absent.csv: there is no such file"),
         ("import table.csv -o out.h5", "v_th, v_out, pulse_rate, scale: are not given"),
         (f"import table.csv -o s.h5 {OPEN}", "v_out: is channel 'open', and so is v_th"),
+        (f"import a.csv -o s.h5 {TWICE}", "c.csv, calibrations: is given with two resistors"),
         ("fit study.h5 -o absent/f.h5", "absent/f.h5: the folder of this file does not exist"),
         ("simulate paper_dry -o absent/s.h5", "absent/s.h5: the folder of this file"),
         ("simulate paper_dry -o s.h5 --truth absent/t.json", "absent/t.json: the folder"),

@@ -238,6 +238,7 @@ def test_a_missing_package_is_named_with_its_extra(
         ("fits.h5 -o t.abc", "t.abc: fits are exported as .csv or .parquet, not '.abc'"),
         ("fits.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "schema: is 'etid/fits'"),
         ("absent.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "no such file"),
+        ("empty.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "empty.h5: holds no recording"),
         ("study.h5 -o t.nwb", "session_start: is not given with a time zone"),
         ("fits.h5 -o t.csv --session-start 2026-01-31", "--session-start is only for .nwb"),
         ("fits.h5 -o t.csv --path path", "t.csv: --path is only for .cir and"),
@@ -252,6 +253,7 @@ def test_what_cannot_be_exported_is_one_line(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "garbage.h5").write_bytes(b"no HDF5")
+    etid.Study({}).write(tmp_path / "empty.h5")
     (tmp_path / "short.h5").write_bytes(file.read_bytes())
     with h5py.File(tmp_path / "short.h5", "a") as content:
         del content["chi2"]

@@ -47,6 +47,20 @@ def test_names_become_labels_and_the_mapping_beside_the_file_imports_the_same(fo
         np.testing.assert_allclose(second.v_out, 2 * pulses(0.4))
 
 
+def test_each_file_has_its_own_units_and_notes(folder, tmp_path):
+    known, other = folder / "d1_cal_98k8.csv", folder / "s01_d1_07.csv"
+    known.write_text(known.read_text("utf-8").replace("skin", "skin [mV]"), "utf-8")
+    other.write_text(other.read_text("utf-8")[:-5], "utf-8")
+    found = import_folder(folder, tmp_path / "study.h5", PATTERNS, **OPTIONS)
+    lines = str(found).splitlines()
+    (note,) = (i for i, line in enumerate(lines) if "the file may have been cut off" in line)
+    assert lines[note - 1].startswith("s01_d1_07.csv → ")
+    assert "  v_out   'skin' in mV (file), divided by 0.5: 'd1_cal_98k8.csv'" in lines
+    assert "  v_th    'open' in V (command), divided by 0.5" in lines
+    import_file(folder, tmp_path / "again.h5", found.mapping)
+    assert (tmp_path / "study.h5").read_bytes() == (tmp_path / "again.h5").read_bytes()
+
+
 def test_the_command_replaces_no_mapping_unasked(folder, tmp_path, capsys):
     (tmp_path / "study.toml").write_text("mine", "utf-8")
     words = ["import", str(folder), "-o", str(tmp_path / "study.h5"), "--labels", PATTERNS[0]]
@@ -62,6 +76,20 @@ def test_a_table_names_resistors_of_files_whose_names_do_not(folder):
     found, unmatched = labelled(folder, ["{subject}_{session}_{trial}.csv"])
     assert found["d1_cal_98k8.csv"]["r_load"] == 21.62e3
     assert unmatched == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("d1_cal_98k8.csv, 98800\nd1_cal_98k8.csv, 21k62", "file: lists 'd1_cal_98k8.csv' twice"),
+        ("d1_cal_98k8.csv, 21k62", "ohm: says 21620 ohm of 'd1_cal.*', whose name says 98800 ohm"),
+        ("s01_d1_07.csv, 98.8 kOhm", r"ohm: is '98.8 kOhm'.* Write it as 98800, 98k8 or 98.8k\.$"),
+    ],
+)
+def test_refusals_of_the_table_of_resistors(folder, rows, message):
+    (folder / "calibrations.csv").write_text(f"file, ohm\n{rows}\n", "utf-8")
+    with pytest.raises(RecordingError, match=rf"calibrations\.csv, {message}"):
+        labelled(folder, PATTERNS)
 
 
 def test_a_name_that_could_be_read_in_two_ways_does_not_match():

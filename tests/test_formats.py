@@ -239,7 +239,7 @@ def test_v_th_may_be_a_channel_of_another_file(tmp_path, monkeypatch):
     wrong = columns("open.csv:b", "skin", sample_rate=2e5)
     refused(finger, wrong, "the names are 'skin', 'open.csv:a'")
     pathlib.Path("open.csv").write_text("a\n1\n2\nx\n", encoding="utf-8")
-    with pytest.raises(RecordingError, match=r"^open\.csv: cannot be read"):
+    with pytest.raises(RecordingError, match=r"^open\.csv: line 4 has 'x'"):
         etid.import_file(finger, "t.h5", told)
 
 
@@ -294,3 +294,27 @@ def test_units_are_those_of_the_si_and_their_names():
         assert parse_unit(text) == (factor, unit), text
     for text in ("", "MV", "mv", "v", "a", "S", "Ohm", "degC", "V/A", "1"):
         assert parse_unit(text) is None, text
+
+
+@pytest.mark.parametrize(
+    ("head", "name", "unit"),
+    [
+        ("skin [mV]", "skin", "mV"),
+        ("skin / mV", "skin", "mV"),
+        ("skin [left]", "skin [left]", ""),
+        ("skin (a)", "skin (a)", ""),
+        ("rig/V", "rig/V", ""),
+        *((f"skin {wrong}", "skin", None) for wrong in ("[mv]", "(MV)", "[uVolt]", "/ mv")),
+    ],
+)
+def test_a_name_contains_a_unit_that_is_known_or_refused(head, name, unit, tmp_path):
+    path, told = (
+        table(tmp_path, f"open [V],{head}\n1,2\n3,4\n"),
+        pair("open", name, sample_rate=1e4),
+    )
+    if unit is None:
+        refused(path, told, rf"v_out\.unit: the file says .* of channel '{name}', which is neither")
+        return
+    told["v_out"] |= {} if unit else {"unit": "V"}
+    _, [used] = imported(path, told)
+    assert used.signals["v_out"].unit == (unit or "V")

@@ -82,7 +82,7 @@ def on_disk_of():
         ("export", "out.csv", (0, 0.5)),
         ("export", "out.parquet", (0, 0.5, 0.999)),
         ("export", "out.cir", (0.5,)),
-        ("export", "out.nwb", (0, 0.3, 0.9, 0.999)),
+        ("export", "out.nwb", (0, 0.3, 0.5, 0.9, 0.999)),
     ],
 )
 def test_a_full_disk_ends_a_command_in_one_line_and_changes_no_file(
@@ -131,6 +131,17 @@ def test_a_run_on_a_full_disk_is_resumed(study, on_disk_of, tmp_path):
     assert on_disk_of(unlimited, *command, "--resume") == (0, "")
     assert len(etid.Fits.read(tmp_path / "fits.h5")) == 18
     assert not kept.exists()
+
+
+def test_an_import_blames_the_folder_of_its_output_and_not_its_input(on_disk_of, tmp_path):
+    table, folder = tmp_path / "table.csv", tmp_path / "out"
+    folder.mkdir()
+    table.write_text("open,skin\n" + "0.5,0.25\n" * 1000, "utf-8")
+    arguments = ("--v-th=open", "--v-out=skin", "--sample-rate=2e5", "--pulse-rate=60", "--scale=1")
+    status, errors = on_disk_of(5000, "import", table, "-o", folder / "out.h5", *arguments)
+    assert status == 1
+    assert errors.startswith(f"etid: error: {folder}: cannot be written ([Errno 27] File too large")
+    assert not [*folder.iterdir()]
 
 
 def test_a_device_is_not_replaced_by_a_file(capsys):

@@ -141,8 +141,9 @@ SHIFTED = "t,th,out{0}\n0,1.5,2.5{0}\n{1}\n0,1.5,2.5{0}\n"
     [
         ("", {}, "there is no 'th'; the names are none"),
         ("th,out\n", {}, "the table has no rows"),
-        ("th,out\n1,2\n3,x\n", {}, "cannot be read .*'x'"),
-        ("th,out\n1,2\n3,\n", {}, "cannot be read"),
+        ("th,out\n1,2\n\n3,x\n", {}, "line 4 has 'x' in column 2, must be a number"),
+        ("th,out\n" + 70000 * "1,2\n" + "3,x\n", {}, "line 70002 has 'x' in column 2"),
+        ("th,out\n1,2\n3,\n", {}, "line 3 has '' in column 2"),
         ("th,out\n1,2\n3\n", {}, "line 3 has 1 cells"),
         ("th;out\n1;2\n", {}, "there is no 'th'; the names are 'th;out'"),
         ("th,out,th\n1,2,3\n", {}, "two channels have the name 'th'"),

@@ -127,6 +127,11 @@ def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
     assert recording.sample_rate == pytest.approx(RATE)
     [recording], _ = imported(tmp_path / "a.xlsx", v_th="second/open", v_out="open", time="t")
     np.testing.assert_allclose(recording.v_th, 2 * th)
+    book["second"].insert_rows(2)
+    book["second"]["A2"] = "(mV)"
+    book.save(tmp_path / "a.xlsx")
+    [recording], _ = imported(tmp_path / "a.xlsx", v_th="second/open", v_out="open", time="t")
+    np.testing.assert_allclose(recording.v_th, 2e-3 * th)
 
 
 def test_arrays_of_an_npz_file_are_channels(tmp_path):
@@ -179,8 +184,12 @@ def in_turn(rests=(2000, 2000)):
     ],
 )
 def test_electrodes_that_fire_in_turn_become_recordings_of_each(tmp_path, given):
-    recordings, _ = of_arrays(tmp_path, in_turn(), **given)
-    found = {one.path: (one.electrode, one.trial) for one in recordings}
+    th, out = pulses()
+    np.savez(tmp_path / "known.npz", th=th, out=out)
+    calibrations = {tmp_path / "known.npz": 98.8e3}
+    (known, *recordings), _ = of_arrays(tmp_path, in_turn(), calibrations=calibrations, **given)
+    assert (known.path, known.electrode) == ("calibration/known", "")
+    found = {one.path.replace("/a/", "/"): (one.electrode, one.trial) for one in recordings}
     assert found == {f"loaded/{e}/{n}": (e, n) for e in ("E7", "E12") for n in ("0", "1")}
     for one in recordings:
         assert round(one.periods, 2) == 3
@@ -208,6 +217,8 @@ def test_electrodes_may_fire_without_a_pause(tmp_path):
          "cuts the first or the last"),
         ({"split": "tilted", "electrode": "{tilted}"}, "is 3.75 at sample"),
         ({"split": "what", "electrode": "E{what}"}, "there is no 'what'"),
+        ({"split": "pulses", "electrode": "E{which}"}, "is .* not split by a channel"),
+        ({"electrode": "E{which}"}, "electrode: is 'E{which}', but the record is not"),
         ({"split": "which", "electrode": "E{which}", "trial": 3}, "1 labels for 4 trials"),
         ({"split": "pulses", "v_out": "stack"}, "can be split"),
     ],

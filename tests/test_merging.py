@@ -1,9 +1,11 @@
 """Files of recordings become one, and each recording keeps its calibration."""
 
 import numpy as np
+import pytest
 
 import etid
 from etid import cli
+from etid.recordings.hdf5 import merge_files
 
 
 def test_each_file_becomes_a_group_and_keeps_its_calibration(tmp_path, capsys):
@@ -33,3 +35,23 @@ def test_each_file_becomes_a_group_and_keeps_its_calibration(tmp_path, capsys):
                     assert (other.subject, other.trial) == (one.subject, one.trial)
                     if one.metadata.kind == "loaded":
                         assert other.calibration == (f"{source.stem}/{calibration}",)
+
+
+@pytest.mark.parametrize("current_snr_db", [None, 60.0])
+def test_a_recording_without_a_calibration_gets_none_of_another_file(current_snr_db, tmp_path):
+    scene = etid.scenes.paper_dry(samples=400, current_snr_db=current_snr_db)
+    known, dry, *_ = scene.simulate(1).recordings()
+    alone, other = tmp_path / "alone.h5", tmp_path / "other.h5"
+    etid.Study.from_recordings([dry.replace(calibration=())]).write(alone)
+    etid.Study.from_recordings([known]).write(other)
+    with pytest.raises(etid.RecordingError, match=rf"alone\.h5, '{dry.path}': has no calibration"):
+        merge_files([other, alone], tmp_path / "study.h5")
+
+
+def test_a_recording_without_v_th_needs_no_calibration(tmp_path):
+    scene = etid.scenes.paper_dry(samples=400, current_snr_db=60.0)
+    known, dry, *_ = scene.simulate(1).recordings()
+    for name, one in (("known.h5", known), ("dry.h5", dry.replace(calibration=(), v_th=None))):
+        etid.Study.from_recordings([one]).write(tmp_path / name)
+    counts = merge_files([tmp_path / "known.h5", tmp_path / "dry.h5"], tmp_path / "study.h5")
+    assert counts == {"known": 1, "dry": 1}

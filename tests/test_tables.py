@@ -8,7 +8,7 @@ from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 from etid.results.hdf5_table import check_same_length, opened_table, write_table
 
-KIND = "etid/test"
+KIND = "etid/test", "1.2"
 COLUMNS = {
     "name": np.array(["a", "Ω", ""]),
     "size": np.array([1.5, np.nan, -np.inf]),
@@ -17,7 +17,11 @@ COLUMNS = {
     "single": np.array([1.0, 2.0, 3.0], np.float32),
     "half": np.array([True, False, True]),
 }
-ATTRIBUTES = {"schema": KIND, "number": 3.5, "list": ["x", "y"], "texts": np.array([b"x", b"y"])}
+ATTRIBUTES = dict(zip(("schema", "schema_version"), KIND, strict=True)) | {
+    "number": 3.5,
+    "list": ["x", "y"],
+    "texts": np.array([b"x", b"y"]),
+}
 
 
 @pytest.fixture
@@ -32,9 +36,9 @@ def test_columns_units_and_attributes_are_kept(path):
         assert {name: dict(file[name].attrs) for name in file if dict(file[name].attrs)} == {
             "size": {"unit": "Ω"}
         }
-    with opened_table(path, KIND) as table:
+    with opened_table(path, *KIND) as table:
         assert table.attributes == set(ATTRIBUTES)
-        assert table.text("schema") == KIND
+        assert table.text("schema") == KIND[0]
         assert table.attribute("number") == 3.5
         assert table.attribute("list") == table.attribute("texts") == ["x", "y"]
         assert "size" in table
@@ -81,7 +85,7 @@ def test_a_wrong_column_or_attribute_is_one_error_that_names_it(path, method, ar
         file["wide"] = np.ones(3, complex)
         file["elsewhere"] = h5py.ExternalLink("other.h5", "/size")
         file.attrs["wide"] = 1j
-    with opened_table(path, KIND) as table:
+    with opened_table(path, *KIND) as table:
         with pytest.raises(RecordingError, match=words) as raised:
             getattr(table, method)(*arguments)
         assert raised.value.field == arguments[0]
@@ -89,7 +93,7 @@ def test_a_wrong_column_or_attribute_is_one_error_that_names_it(path, method, ar
 
 
 def test_more_rows_than_are_read_are_refused(path, monkeypatch):
-    with opened_table(path, KIND) as table:
+    with opened_table(path, *KIND) as table:
         monkeypatch.setattr(limits, "FITS", 3)
         table.column("size", "number")
         monkeypatch.setattr(limits, "FITS", 2)
@@ -98,25 +102,27 @@ def test_more_rows_than_are_read_are_refused(path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("schema", "words", "remedy"),
+    ("name", "value", "words", "remedy"),
     [
-        ("etid/recording", "is 'etid/recording', not", "file of recordings"),
-        ("etid/else", "is 'etid/else', not", "Name another file"),
-        (None, "is None, not", "Name another file"),
+        ("schema", "etid/recording", "is 'etid/recording', not", "file of recordings"),
+        ("schema", "etid/else", "is 'etid/else', not", "Name another file"),
+        ("schema", None, "is None, not", "Name another file"),
+        ("schema_version", "9.0", "is 9.0, this version of etid reads 1.x", "Fit the recordings"),
+        ("schema_version", None, "is missing", "Fit the recordings"),
     ],
 )
-def test_a_file_of_another_schema_is_refused(path, schema, words, remedy):
+def test_a_file_of_another_schema_is_refused(path, name, value, words, remedy):
     with h5py.File(path, "a") as file:
-        del file.attrs["schema"]
-        if schema is not None:
-            file.attrs["schema"] = schema
-    with pytest.raises(RecordingError, match=words) as raised, opened_table(path, KIND):
+        del file.attrs[name]
+        if value is not None:
+            file.attrs[name] = value
+    with pytest.raises(RecordingError, match=words) as raised, opened_table(path, *KIND):
         pass
     assert remedy in str(raised.value)
 
 
 def test_columns_of_different_lengths_are_refused(path):
-    with opened_table(path, KIND) as table:
+    with opened_table(path, *KIND) as table:
         check_same_length(table, {})
         check_same_length(table, {"a": np.zeros(3), "b": np.zeros((3, 2))})
         with pytest.raises(RecordingError, match="has 2 rows, a has 3") as raised:

@@ -5,14 +5,13 @@ The files may be .csv, .mat, .tdms, .abf, .npz, .wav, .lvm and .xlsx.
 
 import argparse
 import dataclasses
-import os
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from etid.commands import Outcome
 from etid.files.folder import import_folder
-from etid.files.importing import import_file
+from etid.files.importing import import_file, resistors
 from etid.files.mapping import CHANNELS, FIELDS
 from etid.files.readers.delimited import DIALECT
 from etid.recordings.errors import RecordingError
@@ -106,11 +105,13 @@ def run(arguments: argparse.Namespace) -> Outcome:
     folder = os.path.isdir(arguments.source[0]) and arguments.mapping is None
     if folder or arguments.labels:
         return _folder(arguments, given)
-    calibrations: dict[str | os.PathLike[str], float] = {
-        pathlib.Path(file): _ohm(file, text) for file, text in arguments.calibrations
-    }
+    calibrations = resistors((file, _ohm(file, text)) for file, text in arguments.calibrations)
     used = import_file(
-        arguments.source, arguments.target, arguments.mapping, calibrations=calibrations, **given
+        arguments.source,
+        arguments.target,
+        arguments.mapping,
+        calibrations={**calibrations},
+        **given,
     )
     data = {
         "source": [*arguments.source, *calibrations],

@@ -68,8 +68,17 @@ class Imported:
             f"{' … '.join(ends)}: {self.samples} samples at {self.sample_rate:.9g} Hz "
             f"({self.rate_by}), pulses at {self.pulse_rate:.9g} Hz"
         ]
-        lines += [f"  {name:<8}{used}" for name, used in self.signals.items()]
-        return "\n".join(lines + [f"  note: {notice}" for notice in self.notices])
+        return "\n".join([*lines, *self.channels, *self.notes])
+
+    @property
+    def channels(self) -> list[str]:
+        """A line of text for each signal, with its channel and unit."""
+        return [f"  {name:<8}{used}" for name, used in self.signals.items()]
+
+    @property
+    def notes(self) -> list[str]:
+        """A line of text for each notice."""
+        return [f"  note: {notice}" for notice in self.notices]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -232,7 +241,7 @@ def _used(name: str, signal: Signal, said: str, by: str) -> tuple[Used, float]:
         raise RecordingError(
             f"the file says {said!r} {where}, which is neither volts, amperes nor seconds",
             field=field,
-            remedy="Correct it in the file",
+            remedy="Correct it in the file, as in mV, uA or ms",
         )
     if ours and theirs and ours != theirs:
         raise RecordingError(

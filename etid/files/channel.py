@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import itertools
 import pathlib
 import re
 import tempfile
@@ -13,6 +14,7 @@ import numpy as np
 
 from etid.recordings import errors, limits
 from etid.recordings.errors import RecordingError
+from etid.recordings.replacing import unwritable
 
 BLOCK = 1 << 20  # [samples] size of a block in memory, 8 MB of real numbers
 
@@ -172,19 +174,29 @@ def spooled(
     """
     files: dict[str, BinaryIO] = {}
     notice = ""
-    with contextlib.ExitStack() as stack:
+    with _written_in(folder), contextlib.ExitStack() as stack:
 
         def prepare(wanted: Iterable[str]) -> None:
             nonlocal notice
-            for name in wanted:
-                files[name] = stack.enter_context(tempfile.TemporaryFile(dir=folder))
-            notice = write(files)
+            with _written_in(folder):
+                for name in wanted:
+                    files[name] = stack.enter_context(tempfile.TemporaryFile(dir=folder))
+                notice = write(files)
 
         def channel(name: str) -> Channel:
             numbers = np.memmap(files[name], np.float64, "r")
             return array_channel(name, numbers, notice=notice, **about(name))
 
         yield Contents(tuple(names), channel, prepare)
+
+
+@contextlib.contextmanager
+def _written_in(folder: pathlib.Path) -> Iterator[None]:
+    """Name the folder, not the file that is read, if temporary files cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(folder, error) from error
 
 
 def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
@@ -227,27 +239,29 @@ class Unit(NamedTuple):
     si: str
 
 
-def _units() -> dict[str, Unit]:
-    """All units by their spelling: symbols with short prefixes, words with long ones."""
-    micro = "u", "\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"
-    # "M" is missing, because "MV" can be a millivolt in capital letters or a megavolt.
-    short = {"": 1.0, "k": 1e3, "m": 1e-3, **dict.fromkeys(micro, 1e-6), "n": 1e-9, "p": 1e-12}
-    long = {"": 1.0, "kilo": 1e3, "milli": 1e-3, "micro": 1e-6, "nano": 1e-9, "pico": 1e-12}
-    spellings = {
-        "volt": ("V", "volt", "volts"),
-        "ampere": ("A", "ampere", "amperes", "amp", "amps"),
-        "second": ("s", "second", "seconds", "sec"),
-    }
-    return {
-        prefix + name: Unit(factor, unit)
-        for unit, (symbol, *words) in spellings.items()
-        for names, prefixes in (([symbol], short), (words, long))
-        for name in names
-        for prefix, factor in prefixes.items()
-    }
-
-
-UNITS = _units()
+_MICRO = "u", "\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"
+# "M" is missing, because "MV" can be a millivolt in capital letters or a megavolt.
+_SHORT = {"": 1.0, "k": 1e3, "m": 1e-3, **dict.fromkeys(_MICRO, 1e-6), "n": 1e-9, "p": 1e-12}
+_LONG = {"": 1.0, "kilo": 1e3, "milli": 1e-3, "micro": 1e-6, "nano": 1e-9, "pico": 1e-12}
+_SPELLINGS = {
+    "volt": ("V", "volt", "volts"),
+    "ampere": ("A", "ampere", "amperes", "amp", "amps"),
+    "second": ("s", "second", "seconds", "sec"),
+}
+# All units by their spelling: symbols with short prefixes, words with long ones.
+UNITS = {
+    prefix + name: Unit(factor, unit)
+    for unit, (symbol, *words) in _SPELLINGS.items()
+    for names, prefixes in (([symbol], _SHORT), (words, _LONG))
+    for name in names
+    for prefix, factor in prefixes.items()
+}
+# Texts that mean a unit, known or not, in small letters. A letter alone may be a label.
+_MEANT = {
+    (prefix + name).lower()
+    for name in itertools.chain.from_iterable(_SPELLINGS.values())
+    for prefix in (*_SHORT, *_LONG, "g", "mega", "giga")
+} - {"a", "s", "v"}
 
 
 def parse_unit(text: str) -> Unit | None:
@@ -260,11 +274,16 @@ def parse_unit(text: str) -> Unit | None:
 
 
 def with_unit(name: str) -> tuple[str, str]:
-    """Name and unit of a channel, from `name [unit]` or `name (unit)`; the unit may be empty."""
-    match = re.fullmatch(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]+)[\])]", name)
-    if match is None or not parse_unit(match["unit"]):
+    """Name and unit of a channel, from `name [unit]`, `name (unit)` or `name / unit`.
+
+    The unit may be empty. It is the text in the brackets, known or not, if it means a unit; another
+    text belongs to the name.
+    """
+    match = re.fullmatch(r"(.*\S)\s*(?:[\[(]([^\[\]()]+)[\])]|\s/\s+(\S+))", name)
+    if match is None:
         return name, ""
-    return match["name"], match["unit"].strip()
+    unit = (match[2] or match[3]).strip()
+    return (match[1], unit) if parse_unit(unit) or unit.lower() in _MEANT else (name, "")
 
 
 def one_unit(name: str, *said: str) -> str:

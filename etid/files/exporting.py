@@ -22,7 +22,7 @@ from etid.recordings.errors import RecordingError, optional
 from etid.recordings.replacing import replace_text, replacing
 from etid.recordings.untrusted import attribute, translated
 from etid.results.fit import Fit
-from etid.results.fits import DESCRIBED, SCHEMA, Fits
+from etid.results.fits import DESCRIBED, SCHEMA, VERSION, Fits
 from etid.results.fits_columns import long_form
 from etid.results.hdf5_table import REMEDY, Table, check_same_length, opened_table
 
@@ -65,7 +65,7 @@ def export_fits(
         raise ValueError(
             f"{os.fspath(target)}: fits are exported as {' or '.join(TABLES)}, not {suffix!r}"
         )
-    with opened_table(source, SCHEMA) as table, replacing(target) as partial:
+    with opened_table(source, SCHEMA, VERSION) as table, replacing(target) as partial:
         names = _elements(table)
         columns = _columns(table, names)
         if not all:

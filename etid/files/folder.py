@@ -10,6 +10,7 @@ The table `calibrations.csv` of a folder, with the columns `file` and `ohm`, nam
 """
 
 import dataclasses
+import math
 import os
 import pathlib
 import re
@@ -20,8 +21,9 @@ import tomli_w
 
 from etid.circuits.display import several
 from etid.files.assemble import Imported
-from etid.files.channel import located
+from etid.files.channel import listed, located
 from etid.files.importing import channels_of, converted
+from etid.files.mapping import CHANNELS
 from etid.files.pattern import pattern
 from etid.recordings.errors import RecordingError
 from etid.recordings.fields import LABELS, real
@@ -51,14 +53,20 @@ class ImportedFolder:
 
     def __str__(self) -> str:
         lines = []
+        files_of: dict[str, list[str]] = {}  # the files with a line about a channel
         for file, labels in self.labels.items():
             of = self.imported[file]
             said = [f"{n} {labels[n]}" for n in labels if n != "r_load"]
             said += [f"{labels[n] / 1e3:g} kΩ" for n in labels if n == "r_load"]
             where = of.paths[0] + (f" … {of.paths[-1]}" if len(of.paths) > 1 else "")
             lines.append(f"{file} → {where}: {', '.join(said)}; {of.samples} samples")
-        # All files have the same options, so the channels of the first are those of all.
-        _, *channels = str(next(iter(self.imported.values()))).splitlines()
+            lines += of.notes
+            for line in of.channels:
+                files_of.setdefault(line, []).append(file)
+        channels = [  # files differ where only some name a unit
+            line if len(files) == len(self.labels) else f"{line}: {listed(files)}"
+            for line, files in files_of.items()
+        ]
         known = sum("r_load" in of for of in self.labels.values())
         files = several(len(self.labels), "file")
         lines += [*channels, f"{files}, {known} of them with a known resistor"]
@@ -110,13 +118,32 @@ def import_folder(
     said = {root / file: {**common, **of} for file, of in tables.items()}
     imported = converted(said, target)
     mapping = pathlib.Path(os.fspath(target)).with_suffix(".toml")
-    for name, used in imported[0].signals.items():
-        if used.unit_by == "command":  # a mapping implies no units
-            common[name]["unit"] = used.unit
+    files = dict(zip(tables, imported, strict=True))
+    _say_units(common, tables, files)
     content = {**common, "recording": [{"file": file, **of} for file, of in tables.items()]}
     with replacing(mapping) as partial:
         partial.write_text(tomli_w.dumps(content), "utf-8")
-    return ImportedFolder(dict(zip(tables, imported, strict=True)), found, unmatched, mapping)
+    return ImportedFolder(files, found, unmatched, mapping)
+
+
+def _say_units(
+    common: dict[str, Any], tables: Mapping[str, dict[str, Any]], files: Mapping[str, Imported]
+) -> None:
+    """Add the units that the command implied, because a mapping implies none.
+
+    They come into the table of each file that names none itself, or into `common` if no file does.
+    """
+    for name in [name for name in CHANNELS if name in common]:
+        implied = {
+            file: {**common[name], "unit": of.signals[name].unit}
+            for file, of in files.items()
+            if of.signals[name].unit_by == "command"
+        }
+        if len(implied) == len(files):
+            common[name] = next(iter(implied.values()))
+        else:
+            for file, channel in implied.items():
+                tables[file][name] = channel
 
 
 def labelled(
@@ -146,7 +173,14 @@ def labelled(
         if "r_load" in of:
             of["r_load"] = resistance(of["r_load"], str(root / file))
         if file in known:
-            of["r_load"] = known[file]
+            named = of.setdefault("r_load", known[file])
+            if not math.isclose(named, known[file]):
+                raise RecordingError(
+                    f"says {known[file]:g} ohm of {file!r}, whose name says {named:g} ohm",
+                    file=str(root / TABLE),
+                    field="ohm",
+                    remedy="Correct the one that is wrong",
+                )
         found[file] = of
     for missing in known.keys() - found.keys():
         raise RecordingError(
@@ -164,8 +198,13 @@ def labelled(
     return calibrations_first, [file for file in files if file not in found]
 
 
-def resistance(text: str, file: str) -> float:
+def resistance(text: str, file: str, field: str = "r_load") -> float:
     """Resistance [ohm] of a text such as 98800, 98k8 (IEC 60062) or 98.8k.
+
+    Args:
+        text: The text.
+        file: File with this resistor, or the table that lists it.
+        field: The label, or the column of the table.
 
     Raises:
         RecordingError: The text is no resistance.
@@ -175,8 +214,9 @@ def resistance(text: str, file: str) -> float:
         raise RecordingError(
             f"is {text!r}, which is no resistance",
             file=file,
-            field="r_load",
-            remedy=f"Write it as 98800, 98k8 or 98.8k, or list the file in {TABLE}",
+            field=field,
+            remedy="Write it as 98800, 98k8 or 98.8k"
+            + f", or list the file in {TABLE}" * (field == "r_load"),
         )
     whole, middle, rest, number, last = match.groups()
     if number is not None:
@@ -192,10 +232,14 @@ def _table(root: pathlib.Path) -> dict[str, float]:
     with located(str(table)):
         found = {}
         for row in rows_of(table, ("file", "ohm")):
+            if row["file"] in found:
+                raise RecordingError(
+                    f"lists {row['file']!r} twice", field="file", remedy="Keep one of the rows"
+                )
             try:
                 found[row["file"]] = real("ohm", float(row["ohm"]))
             except ValueError:
-                found[row["file"]] = resistance(row["ohm"], str(table))
+                found[row["file"]] = resistance(row["ohm"], str(table), "ohm")
         return found
 
 

@@ -68,7 +68,7 @@ def import_file(
 
     With `split`, one long record becomes several trials: `"pulses"` splits it at the pauses between
     its pulses, the name of a trigger channel at the rising edges of the trigger. Files of
-    `calibrations` are not split.
+    `calibrations` are not split, and get none of the electrodes of the parts.
 
     A channel may be in another file, as when V_th was recorded once for all trials: `FILE:NAME` is
     channel `NAME` of `FILE`, a path from the current folder.
@@ -105,7 +105,7 @@ def import_file(
     """
     single = isinstance(source, str | os.PathLike)
     paths = [pathlib.Path(os.fspath(one)) for one in ([source] if single else source)]
-    known = {pathlib.Path(os.fspath(one)): r for one, r in (calibrations or {}).items()}
+    known = resistors((calibrations or {}).items())
     paths = [*known, *(path for path in paths if path not in known)]  # loaded ones name the others
     given = {name: value for name, value in given.items() if value is not None}
     complete = None
@@ -121,7 +121,8 @@ def import_file(
         return converted({paths[0]: own}, target, by="file")
     if mapping is None:
         common = channels_of(given)
-        whole = {name: value for name, value in common.items() if name != "split"}
+        turns = ("split", "electrode") if "split" in common else ()
+        whole = {name: value for name, value in common.items() if name not in turns}
         named = {"calibration": [f"{KINDS[1]}/{path.stem}" for path in known]} if known else {}
         said = {
             path: whole | {"r_load": known[path]} if path in known else common | named
@@ -141,6 +142,28 @@ def import_file(
             names = [path.name for path in paths]
         tables = of_files(content, names)
     return converted(dict(zip(paths, tables, strict=True)), target, place=place, by="mapping")
+
+
+def resistors(
+    calibrations: Iterable[tuple[str | os.PathLike[str], float]],
+) -> dict[pathlib.Path, float]:
+    """The known resistor of each file of calibrations [ohm].
+
+    Raises:
+        RecordingError: A file occurs twice.
+    """
+    known: dict[pathlib.Path, float] = {}
+    for one, r_load in calibrations:
+        path = pathlib.Path(os.fspath(one))
+        if path in known:
+            raise RecordingError(
+                f"is given with two resistors, {known[path]} and {r_load} ohm",
+                file=str(path),
+                field="calibrations",
+                remedy="Give each file once, with the resistor with which it was recorded",
+            )
+        known[path] = r_load
+    return known
 
 
 def channels_of(given: Mapping[str, Any]) -> dict[str, Any]:

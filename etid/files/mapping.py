@@ -250,8 +250,15 @@ def _plan(path: str, said: Mapping[str, Any], names: Sequence[str]) -> Plan:
 def _electrodes(said: Any, split: str) -> tuple[str, ...]:
     """The electrodes that fire in turn within one record; empty if it is of one electrode."""
     several = isinstance(said, list)
-    if not several and not (isinstance(said, str) and f"{{{split}}}" in said):
+    numbered = isinstance(said, str) and re.search(r"\{(.*)\}", said)
+    if not several and not numbered:
         return ()
+    if numbered and (numbered[1] != split or split in ("", PAUSES)):
+        raise RecordingError(
+            f"is {said!r}, but the record is not split by a channel {numbered[1]!r}",
+            field="electrode",
+            remedy="Give split the channel of the number in braces, or leave out the braces",
+        )
     if several and (not split or not said):
         raise RecordingError(
             f"is the list {said!r}: the electrodes of the parts of one long record, in turn",

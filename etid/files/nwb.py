@@ -3,13 +3,16 @@
 This module needs pynwb, so `etid.files.exporting` imports it only for an export.
 """
 
+import contextlib
 import datetime
 import hashlib
+import io
 import os
 import pathlib
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from typing import Any
 
+import h5py
 import hdmf.common
 import numpy as np
 import pynwb
@@ -19,7 +22,7 @@ from etid.recordings import schema
 from etid.recordings.fields import DECLARED, SIGNALS
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import AbstractSource, Layout, RecordingError
-from etid.recordings.replacing import replacing_hdf5
+from etid.recordings.replacing import replacing
 
 # pynwb declares its arguments with a decorator that hides them from the type checker.
 _nwb: Any = pynwb
@@ -35,6 +38,10 @@ def write_nwb(
     with read(source) as study, pathlib.Path(source).open("rb") as content:
         if study.problems:
             raise next(iter(study.problems.values()))
+        if not study:
+            raise RecordingError(
+                "holds no recording", file=study.file, remedy="Name a file with recordings"
+            )
         subjects = {study.metadata(path).subject for path in study}
         only = subjects.pop() if len(subjects) == 1 else ""
         file = _nwb.NWBFile(
@@ -64,10 +71,47 @@ def write_nwb(
         )
         file.add_acquisition(table)
         with (
-            replacing_hdf5(target) as written,
+            replacing(target) as partial,
+            _created(partial) as written,
             _nwb.NWBHDF5IO(file=written, mode="w") as output,
         ):
             output.write(file)
+
+
+@contextlib.contextmanager
+def _created(path: pathlib.Path) -> Iterator[h5py.File]:
+    """An HDF5 file to write; an error of the disk is raised when HDF5 has closed it."""
+    disk = _Disk(path, "xb+")
+    try:
+        with io.BufferedRandom(disk) as raw, h5py.File(raw, "w") as file:
+            yield file
+    finally:
+        if disk.error is not None:
+            raise disk.error
+
+
+class _Disk(io.FileIO):
+    """A file whose first error is kept for the end, and that then loses what is written.
+
+    pynwb leaves objects to the garbage collector. If HDF5 cannot write what belongs to one of them,
+    it ends the process with a segmentation fault.
+    """
+
+    error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            self.error = self.error or error
+            return memoryview(data).nbytes
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
 
 
 class _Samples(GenericDataChunkIterator):

@@ -9,7 +9,7 @@ import contextlib
 import dataclasses
 import os
 import pathlib
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -274,7 +274,8 @@ def merge_files(
 
     The recordings of `s01.h5` come into the group `s01`: `loaded/0` becomes `s01/loaded/0`. They
     keep their calibrations. A recording that names none gets the only calibration of its own file.
-    Samples are copied in blocks.
+    If its file has none, files that have some are refused: their driver is not its own. Samples are
+    copied in blocks.
 
     Args:
         sources: Files of recordings; their names without the ending must differ.
@@ -282,13 +283,16 @@ def merge_files(
 
     Returns:
         Number of recordings of each group.
+
+    Raises:
+        RecordingError: A file cannot be read, two have one name, or a recording without a
+            calibration would come beside calibrations of other files.
     """
     paths = [pathlib.Path(os.fspath(source)) for source in sources]
-    merged: dict[str, AbstractSource] = {}
-    counts: dict[str, int] = {}
+    studies: dict[str, Study] = {}
     with contextlib.ExitStack() as files:
         for path in paths:
-            if path.stem in counts:
+            if path.stem in studies:
                 raise RecordingError(
                     f"another file has the name {path.stem!r}, which becomes the name of its group",
                     file=str(path),
@@ -297,10 +301,29 @@ def merge_files(
             study = files.enter_context(read(path))
             for problem in study.problems.values():
                 raise problem
-            counts[path.stem] = len(study)
-            merged |= _moved(study, path.stem)
+            studies[path.stem] = study
+        _refuse_other_drivers(studies.values())
+        merged: dict[str, AbstractSource] = {}
+        for group, study in studies.items():
+            merged |= _moved(study, group)
         Study(merged).write(target)
-    return counts
+        return {group: len(study) for group, study in studies.items()}
+
+
+def _refuse_other_drivers(studies: Collection[Study]) -> None:
+    """Raise an error if a recording has no calibration, but would come beside foreign ones."""
+    if not any(study.calibrations for study in studies):
+        return
+    for study in studies:
+        for path in () if study.calibrations else study.loaded:
+            if "v_th" in {record.name for record in study.source(path).layout}:
+                raise RecordingError(
+                    "has no calibration, and those of the other files may be of another driver",
+                    file=study.file,
+                    path=path,
+                    remedy="Import it with its own, etid import --calibration FILE OHM, or fit its "
+                    "file alone, with the driver of another: etid fit --driver FILE",
+                )
 
 
 def _moved(study: Study, group: str) -> dict[str, AbstractSource]:

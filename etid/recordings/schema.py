@@ -76,13 +76,13 @@ def at(place: Place) -> dict[str, Field]:
     return {field.name: field for field in FIELDS if field.place == place}
 
 
-def version_problem(version: str) -> str | None:
-    """Reason why this reader cannot read a file of a version; None if it can."""
+def version_problem(version: str, own: str = VERSION) -> str | None:
+    """Reason why a reader of its own version cannot read a file of a version; None if it can."""
     major, _, minor = version.partition(".")
     if not (major.isascii() and major.isdigit() and minor.isascii() and minor.isdigit()):
         return f"is {version!r}, must be 'major.minor'"
-    if major != VERSION.partition(".")[0]:
-        return f"is {version}, this version of etid reads {VERSION.partition('.')[0]}.x"
+    if major != own.partition(".")[0]:
+        return f"is {version}, this version of etid reads {own.partition('.')[0]}.x"
     return None
 
 

@@ -17,7 +17,15 @@ from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.errors import install
 from etid.recordings.fields import DESCRIBING, Label, wanted_labels
 from etid.results.fit import Fit
-from etid.results.fits_columns import DESCRIBED, LABELS, LIMITS, SCHEMA, columns_of, long_form
+from etid.results.fits_columns import (
+    DESCRIBED,
+    LABELS,
+    LIMITS,
+    SCHEMA,
+    VERSION,
+    columns_of,
+    long_form,
+)
 from etid.results.hdf5_table import Table, opened_table, write_table
 from etid.results.verdicts import counted, counts
 
@@ -214,7 +222,7 @@ class Fits(Overviewed, Generic[Circuit]):
             columns |= {name: np.asarray(getattr(self.fit.limits, name)) for name in LIMITS}
         attributes = {
             "schema": SCHEMA,
-            "schema_version": "1.4",
+            "schema_version": VERSION,
             "etid_version": importlib.metadata.version("etid"),
             "circuit": class_path(type(self.circuit)),
             "parameters": list(self.circuit.names()),
@@ -241,7 +249,7 @@ class Fits(Overviewed, Generic[Circuit]):
             RecordingError: The file is not a file of fits, or its circuit is not `circuit`, or
                 its circuit is neither given nor imported. Reading a file never imports a module.
         """
-        with opened_table(path, SCHEMA) as table:
+        with opened_table(path, SCHEMA, VERSION) as table:
             return cls.of_table(table, circuit)
 
     @classmethod

@@ -17,6 +17,7 @@ from etid.results.hdf5_table import Table, check_same_length
 from etid.results.verdicts import RESULTS, verdicts_of
 
 SCHEMA = "etid/fits"
+VERSION = "1.4"
 # Columns that describe each recording: its path, its labels, and numbers.
 DESCRIBED = {"path": "text"} | {
     name: "text" if field.type == "label" else "number" for name, field in DESCRIBING.items()

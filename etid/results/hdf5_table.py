@@ -11,6 +11,7 @@ import numpy as np
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import check_ending, replacing_hdf5
+from etid.recordings.schema import version_problem
 from etid.recordings.untrusted import (
     attribute,
     check_size,
@@ -157,15 +158,16 @@ class Table:
 
 
 @contextlib.contextmanager
-def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[Table]:
+def opened_table(path: str | os.PathLike[str], kind: str, version: str) -> Iterator[Table]:
     """Open a file of columns.
 
     Args:
         path: The file.
         kind: Value that the attribute `schema` must have.
+        version: Version of this schema that the reader knows.
 
     Raises:
-        RecordingError: The file is missing, is not HDF5, or has another schema.
+        RecordingError: The file is missing, is not HDF5, or has another schema or version.
     """
     name = os.fspath(path)
     with guarded(name) as file:
@@ -181,6 +183,9 @@ def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[Table]:
                 if recordings
                 else "Name another file",
             )
+        problem = version_problem(table.text("schema_version"), version)
+        if problem:
+            raise RecordingError(problem, file=name, field="schema_version", remedy=REMEDY)
         yield table
 
 

@@ -35,7 +35,7 @@ from etid.results.driver import (
     OrderEvidence,
     SourceImpedance,
 )
-from etid.results.fits import SCHEMA, Fits
+from etid.results.fits import SCHEMA, VERSION, Fits
 from etid.results.hdf5_table import REMEDY, Table, opened_table, write_table
 from etid.results.instrument import TOLERANCES, Instrument
 from etid.results.verdicts import verdicts_of
@@ -183,7 +183,7 @@ class StudyFits(Overviewed):
         Raises:
             RecordingError: As in `Fits.read`.
         """
-        with opened_table(path, SCHEMA) as table:
+        with opened_table(path, SCHEMA, VERSION) as table:
             fits = Fits.of_table(table, circuit)
             lines = table.read(table.column("drivers", "text")) if "drivers" in table else ()
             settings = _settings(table)

@@ -15,6 +15,7 @@ import numpy as np
 from etid.circuits.circuit import Resistor, SkinRC
 from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
+from etid.identify.arguments import check_new
 from etid.identify.driver import identify_driver
 from etid.identify.skins import identify_skin
 from etid.precision import in_float64
@@ -174,12 +175,16 @@ def calibrations_in(paths: Sequence[str | os.PathLike[str]]) -> list[Recording]:
     """The recordings with known resistors of some files.
 
     Raises:
-        RecordingError: A file cannot be read, or has such recordings of no driver or of several.
+        RecordingError: A file cannot be read, or has such recordings of no driver or of several, or
+            two recordings have the same samples.
     """
     records: list[Recording] = []
+    first: dict[bytes, str] = {}
     for path in paths:
         with read_calibrations(path) as study:
-            records += study.recordings()
+            for one in study.recordings():
+                check_new(f"{os.fspath(path)}:{one.path}", one, first)
+                records.append(one)
     return records
 
 

@@ -104,14 +104,30 @@ def spool(
                     ndmin=2,
                 )
             except ValueError as error:
-                beyond = f", counted from row {rows + 1}" * bool(rows)
-                raise RecordingError(f"cannot be read ({error}{beyond})") from None
+                _refuse_texts(path, dialect, skipped, columns)
+                raise RecordingError(f"cannot be read ({error})") from None
             for file, column in zip(columns.values(), table.T, strict=True):
                 file.write(np.ascontiguousarray(column).data)
             rows += len(table)
     if not rows:
         raise RecordingError("the table has no rows")
     return rows, _cut_off(recent, dialect)
+
+
+def _refuse_texts(
+    path: pathlib.Path, dialect: Dialect, skipped: int, columns: Iterable[int]
+) -> None:
+    """Raise an error that names the line of the first cell without a number, if there is one."""
+    with path.open(newline="", encoding=dialect.encoding) as text:
+        for number, line in enumerate(itertools.islice(text, skipped, None), skipped + 1):
+            cells = dialect.cells(line)
+            for place in columns if line.strip() else ():
+                cell = cells[place] if place < len(cells) else ""
+                if dialect.number(cell) is None:
+                    raise RecordingError(
+                        f"line {number} has {cell!r} in column {place + 1}, must be a number",
+                        remedy="Correct or remove this line",
+                    )
 
 
 def _rows(

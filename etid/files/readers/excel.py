@@ -1,7 +1,7 @@
 """Reader for Excel workbooks (.xlsx); openpyxl reads them row by row.
 
-The first row of a sheet names its columns, as in a CSV table. A column of the first sheet has its
-own name, a column of another sheet the name `sheet/column`.
+The first row of a sheet names its columns, and the second may name their units, as in a CSV table.
+A column of the first sheet has its own name, a column of another sheet the name `sheet/column`.
 """
 
 import contextlib
@@ -12,8 +12,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from etid.files.channel import Contents, spooled, with_unit
-from etid.files.readers.delimited import ROWS
+from etid.files.channel import Contents, one_unit, spooled, with_unit
+from etid.files.readers.delimited import ROWS, Dialect
 from etid.recordings.errors import RecordingError, optional
 
 
@@ -22,12 +22,13 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Columns of a workbook."""
     openpyxl = optional("openpyxl", "excel", str(path))
     names: list[str] = []  # several columns may have one name
-    places: dict[str, tuple[Any, int, str]] = {}
+    places: dict[str, tuple[Any, int, int]] = {}  # sheet, first row of numbers, column
+    units: dict[str, str] = {}
 
     def write(files: Mapping[str, BinaryIO]) -> str:
         for name, file in files.items():
-            sheet, column, _ = places[name]
-            numbers = _numbers(sheet, column)
+            sheet, first, column = places[name]
+            numbers = _numbers(sheet, first, column)
             while (part := np.fromiter(itertools.islice(numbers, ROWS), float)).size:
                 file.write(part.data)
             if not file.tell():
@@ -40,21 +41,24 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
         )
         stack.callback(book.close)
         for number, sheet in enumerate(book.worksheets):
-            head = next(sheet.iter_rows(max_row=1, values_only=True), ())
-            for column, cell in enumerate(head, 1):
+            head, second, *_ = *sheet.iter_rows(max_row=2, values_only=True), (), ()
+            cells = ["" if cell is None else str(cell) for cell in second]
+            below = Dialect().units(cells, len(head))
+            for column, (cell, said) in enumerate(
+                zip(head, below or [""] * len(head), strict=True), 1
+            ):
                 if cell is not None:
                     name, unit = with_unit(str(cell).strip())
                     names.append(f"{sheet.title}/{name}" * bool(number) or name)
-                    places[names[-1]] = sheet, column, unit
-        yield stack.enter_context(
-            spooled(names, folder, write, lambda name: {"unit": places[name][2]})
-        )
+                    places[names[-1]] = sheet, 2 + (below is not None), column
+                    units[names[-1]] = one_unit(name, unit, said)
+        yield stack.enter_context(spooled(names, folder, write, lambda name: {"unit": units[name]}))
 
 
-def _numbers(sheet: Any, column: int) -> Iterator[float]:
-    """The numbers of a column below its name."""
-    cells = sheet.iter_rows(min_row=2, min_col=column, max_col=column, values_only=True)
-    for row, (cell,) in enumerate(cells, 2):
+def _numbers(sheet: Any, first: int, column: int) -> Iterator[float]:
+    """The numbers of a column from the first row of numbers on."""
+    cells = sheet.iter_rows(min_row=first, min_col=column, max_col=column, values_only=True)
+    for row, (cell,) in enumerate(cells, first):
         if cell is None:  # the column ends; a number below a gap would be in the wrong place
             if any(below is not None for (below,) in cells):
                 raise RecordingError(f"row {row} of column {column} is empty")
