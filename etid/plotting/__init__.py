@@ -21,8 +21,6 @@ from etid.results.posterior import Posterior, Profile
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
 
-NARROW = 2.0  # [inch] panels side by side that would be narrower stand below each other
-
 Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -81,7 +79,8 @@ def plot(
 
     The points of `show="impedance"` are what the recording measures in bands of frequency, with two
     standard errors. `show="residual"` adds the autocorrelation of the residual and its
-    cross-correlation with V_th; of white noise, 99 % lie in the band.
+    cross-correlation with V_th; of white noise, 99 % lie in the band. Aliases of the edges
+    exceed it, too.
 
     The picture of a selection shows magnitude [kΩ] and phase [deg] in bands of frequency with two
     standard errors; points are pale where the error exceeds 30 %. Below are the deviations of each
@@ -103,7 +102,7 @@ def plot(
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
         size: Width and height of this figure [inch]; if not given, one for a screen. In a narrow
-            one, panels stand below each other.
+            one, panels stand below each other, but for those of a map or a posterior.
         title: Replaces the titles of the picture; None leaves them out, as a paper does.
 
     Returns:
@@ -121,8 +120,6 @@ def plot(
     given = None if axes is None else np.asarray(axes, dtype=object).ravel()
 
     def canvas(rows: int, columns: int, usual: tuple[float, float], **options: Any) -> np.ndarray:
-        if size is not None and rows == 1 < columns and size[0] < NARROW * columns:
-            rows, columns = columns, 1  # as in the column of a paper
         if given is None:
             return new_figure(rows, columns, size or usual, pyplot=True, **options)[1]
         if given.size != rows * columns:
