@@ -195,7 +195,7 @@ def faults(figure: Figure) -> list[str]:
         for axis in axes
     ]  # fmt: skip
     labels = [axis.yaxis.label for axis in axes if axis.get_ylabel()]
-    titles = [axis._left_title for axis in axes if axis.get_title(loc="left")]
+    titles = [vars(axis)["_left_title"] for axis in axes if axis.get_title(loc="left")]
     for kind, texts in (*(("ticks", one) for one in ticks), ("labels", labels), ("titles", titles)):
         boxes = [(one.get_text(), one.get_window_extent()) for one in texts]
         for (name, one), (beside, other) in itertools.combinations(boxes, 2):

@@ -54,9 +54,9 @@ def test_titles_of_maps_hide_nothing_and_each_column_has_its_places(display):
     fits = display.take(np.resize(np.arange(6), 21))
     names = np.repeat([f"Anna-Maria Schmidt {i}" for i in range(7)], 3).astype(object)
     labels = {"subject": names, "session": np.full(21, "after washing", object)}
-    axes = figure_of(dataclasses.replace(fits, labels={**fits.labels, **labels}), map="r_p").axes
-    shown = axes[:7]
-    axes[0].figure.draw_without_rendering()
+    figure = figure_of(dataclasses.replace(fits, labels={**fits.labels, **labels}), map="r_p")
+    shown = figure.axes[:7]
+    figure.draw_without_rendering()
     boxes = [axis._left_title.get_window_extent() for axis in shown]  # pyright: ignore[reportAttributeAccessIssue]
     for one, other in itertools.combinations(boxes, 2):
         assert not one.overlaps(other)

@@ -136,8 +136,8 @@ def legend(axes: np.ndarray, handles: Sequence[Any] | None = None) -> None:
     handles = first.get_legend_handles_labels()[0] if handles is None else handles
     if not handles:
         return
-    own = isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine)
-    if not own or len(figure.axes) > axes.size:
+    own = isinstance(figure, Figure) and len(figure.axes) == axes.size
+    if not own or not isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
         first.legend(handles=handles, frameon=True)
         return
     room, beside = figure.get_figwidth(), 5 * size / 72  # [inch] an entry has a mark and spaces
@@ -234,9 +234,9 @@ def titled(axis: Axes, lines: Sequence[str], *, good: bool = True, beside: bool 
         good: Whether the result is valid.
         beside: Whether axes on the right have titles too, so that lines are broken before them.
     """
-    place, width = axis.get_position(), axis.get_figure(root=True).get_figwidth()
-    room = width * place.width if beside else width - max(width * place.x0, MARGIN)
-    text = wrapped("\n".join(filter(None, lines)), room, size := 9.0)
+    panel, whole, dpi = axis.bbox, axis.figure.bbox, axis.figure.dpi
+    room = panel.width if beside else min(whole.x1 - panel.x0, whole.width - MARGIN * dpi)
+    text = wrapped("\n".join(filter(None, lines)), room / dpi, size := 9.0)
     axis.set_title(
         typeset(text), loc="left", fontsize=size, color=INK if good else RED, wrap=not beside
     )
