@@ -65,6 +65,15 @@ def test_titles_of_maps_hide_nothing_and_each_column_has_its_places(display):
     assert [axis.xaxis.get_tick_params()["labelbottom"] for axis in shown] == labelled
 
 
+def test_a_narrow_figure_has_fewer_maps_in_a_row(display):
+    import matplotlib.pyplot as plt
+
+    axes = etid.plot(display.take(np.resize(np.arange(6), 6)), map="r_p", size=(2.0, 4.0))
+    plt.close(axes[0].figure)
+    assert axes[0].get_subplotspec().get_gridspec().get_geometry() == (2, 1)
+    assert pictures.faults(axes[0].figure) == []
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

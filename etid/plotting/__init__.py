@@ -102,7 +102,7 @@ def plot(
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
         size: Width and height of this figure [inch]; if not given, one for a screen. In a narrow
-            one, panels stand below each other, but for those of a map or a posterior.
+            one, panels stand below each other, but for those of a posterior.
         title: Replaces the titles of the picture; None leaves them out, as a paper does.
 
     Returns:
@@ -126,7 +126,8 @@ def plot(
             raise ValueError(f"axes holds {given.size} Axes; this picture takes {rows * columns}")
         return given.reshape(rows, columns)
 
-    drawn = _draw(canvas, x, recording, driver, show=show, by=by, map=map, layout=layout)
+    wide = np.inf if size is None else size[0]
+    drawn = _draw(canvas, x, recording, driver, show=show, by=by, map=map, layout=layout, wide=wide)
     if title != "":
         for axis in drawn.flat:
             axis.set_title("", loc="left")
@@ -157,6 +158,7 @@ def _draw(
     by: Sequence[str] | None = None,
     map: str | None = None,
     layout: "Layout | str | os.PathLike[str] | None" = None,
+    wide: float = np.inf,
 ) -> np.ndarray:
     import matplotlib as mpl
 
@@ -214,7 +216,7 @@ def _draw(
             case Fits(), None, None if map is not None:
                 places = FINGERTIP if layout is None else layout
                 places = places if isinstance(places, Layout) else read_layout(places)
-                return maps.draw_map(canvas, x, map, places)
+                return maps.draw_map(canvas, x, map, places, wide)
             case Fits(), None, None:
                 return elements.draw_fits(canvas, x, by or ("subject", "condition"))
             case Posterior(), None, None:

@@ -27,14 +27,24 @@ from etid.results.fits import Fits
 COLOURS = "cividis"  # readers with and without red-green blindness see it alike
 BY = ("subject", "session", "site", "condition")  # a map for each combination
 ROW = 6  # maps side by side
+LEAST = 1.5  # [inch] width of a map
 DOT = 0.9  # diameter of an electrode, relative to the distance of neighbours
 
 
-def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.ndarray:
+def draw_map(
+    canvas: Canvas, fits: Fits, element: str, layout: Layout, wide: float = np.inf
+) -> np.ndarray:
     """An element at each electrode, a map for each subject, session, site and condition.
 
     The colour is the median of the successful trials of an electrode, on one logarithmic scale for
     all maps. An electrode without a successful trial has a mark of its own for each verdict.
+
+    Args:
+        canvas: Makes the axes.
+        fits: The fits.
+        element: Name of the element.
+        layout: Places of the electrodes.
+        wide: Width of the figure [inch], if it is given; a narrow one has fewer maps in a row.
 
     Raises:
         ValueError: There is no such element, or an electrode has no place.
@@ -50,7 +60,7 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     norm = LogNorm(*(_round(values[good]) if good.any() else (1.0, 10.0)))
     bad = sorted({str(verdict) for verdict in fits.verdicts[~good]} - {"successful"})
     marks = {verdict: nth(MARKS[1:], number) for number, verdict in enumerate(bad)}
-    columns = min(ROW, len(groups))
+    columns = min(len(groups), max(1, int(min(wide / LEAST, ROW))))
     rows = -(-len(groups) // columns)
     width, height = np.ptp(layout.x), np.ptp(layout.y)
     tall = 1.7 * min(max(height / max(width, 1e-9), 0.5), 4.0)
