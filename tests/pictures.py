@@ -7,6 +7,7 @@ writes `tests/baseline/NAME.png`. Look at each before it is committed.
 
 import dataclasses
 import functools
+import itertools
 import pathlib
 from collections.abc import Callable
 
@@ -179,6 +180,31 @@ def profile() -> etid.Profile:
     logs = np.linspace(-0.6, 0.6, 29)
     values = 0.12e-9 * np.exp(logs)
     return etid.Profile("c_p", "farad", 0.12e-9, 0.024e-9, values, (logs / 0.2 - logs**2) ** 2)
+
+
+def faults(figure: Figure) -> list[str]:
+    """What of a picture is cut, hides another part, or lies on the data."""
+    figure.draw_without_rendering()
+    found, whole = [], figure.get_tightbbox()
+    if min(*whole.min, *(figure.get_size_inches() - whole.max)) < 0:
+        found.append(f"cut: {whole.extents}")
+    axes = [axis for axis in figure.axes if axis.get_visible()]
+    ticks = [
+        [one for one in axis.get_xticklabels() if one.get_text() and one.get_visible()
+         and axis.get_xlim()[0] <= one.get_position()[0] <= axis.get_xlim()[1]]
+        for axis in axes
+    ]  # fmt: skip
+    labels = [axis.yaxis.label for axis in axes if axis.get_ylabel()]
+    titles = [vars(axis)["_left_title"] for axis in axes if axis.get_title(loc="left")]
+    for kind, texts in (*(("ticks", one) for one in ticks), ("labels", labels), ("titles", titles)):
+        boxes = [(one.get_text(), one.get_window_extent()) for one in texts]
+        for (name, one), (beside, other) in itertools.combinations(boxes, 2):
+            if one.overlaps(other):
+                found.append(f"{kind} {name!r} and {beside!r}")
+    for legend in figure.legends:
+        box = legend.get_window_extent()
+        found += ["legend on data" for axis in axes if box.overlaps(axis.get_window_extent())]
+    return found
 
 
 PICTURES: dict[str, Callable[[], Figure]] = {

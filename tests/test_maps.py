@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 
 import numpy as np
 import probeinterface
@@ -47,6 +48,30 @@ def test_each_day_has_a_map_and_values_lie_at_their_electrodes(display):
         assert (failed.get_xdata()[0], failed.get_ydata()[0]) == pytest.approx((12.0, 0.0))
     scales = {tuple(axis.collections[0].get_clim()) for axis in axes}
     assert len(scales) == 1
+
+
+def test_titles_of_maps_hide_nothing_and_each_column_has_its_places(display):
+    fits = display.take(np.resize(np.arange(6), 21))
+    names = np.repeat([f"Anna-Maria Schmidt {i}" for i in range(7)], 3).astype(object)
+    labels = {"subject": names, "session": np.full(21, "after washing", object)}
+    figure = figure_of(dataclasses.replace(fits, labels={**fits.labels, **labels}), map="r_p")
+    shown = figure.axes[:7]
+    figure.draw_without_rendering()
+    boxes = [axis._left_title.get_window_extent() for axis in shown]  # pyright: ignore[reportAttributeAccessIssue]
+    for one, other in itertools.combinations(boxes, 2):
+        assert not one.overlaps(other)
+    labelled = [axis.get_xlabel() == "x [mm]" for axis in shown]
+    assert labelled == [False, *[True] * 6]  # six in the first row, one below the first
+    assert [axis.xaxis.get_tick_params()["labelbottom"] for axis in shown] == labelled
+
+
+def test_a_narrow_figure_has_fewer_maps_in_a_row(display):
+    import matplotlib.pyplot as plt
+
+    axes = etid.plot(display.take(np.resize(np.arange(6), 6)), map="r_p", size=(2.0, 4.0))
+    plt.close(axes[0].figure)
+    assert axes[0].get_subplotspec().get_gridspec().get_geometry() == (2, 1)
+    assert pictures.faults(axes[0].figure) == []
 
 
 @pytest.mark.parametrize(

@@ -114,6 +114,7 @@ SHOWN = {
         ["r_load 98.8 kΩ is +2.02 ± 0.1 % off", "misfit", "misses the recording"],
     ),
     "batch": (lambda: fits().fit, ["2 successful, 1 misfit", "r_p 186 … 186 kΩ"]),
+    "one fit": (lambda: fits().take(np.array([0])), ["1 fit of SkinRC: 1 successful"]),
     "fits": (fits, ["3 fits of SkinRC: 2 successful, 1 misfit", "s1 <b> 2/2 33.40 ± 0.10"]),
     "circuit": (lambda: DRY, ["SkinRC", "186 kΩ", "0.12 nF"]),
     "circuits": (lambda: fits().circuit, ["SkinRC", "186 … 186 kΩ"]),

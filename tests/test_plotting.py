@@ -1,7 +1,6 @@
 """Pictures: each as its image, what its axes say, and what is refused."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +15,7 @@ from etid.estimators.lanes import Harmonics
 from etid.plotting import figure_of
 from etid.plotting.bands import CLEAR, bands
 from etid.plotting.pulses import pulse, residual_std
-from etid.plotting.style import RED
+from etid.plotting.style import RED, new_figure
 from etid.recordings.preflight import Inspected
 from tests import pictures
 
@@ -203,8 +202,7 @@ def test_fits_are_by_any_two_labels():
     axes = figure_of(fits, by=("session", "subject")).axes
     assert [one.get_text() for one in axes[-1].get_xticklabels()] == ["d1", "d2", "d3"]
     assert axes[-1].get_xlabel() == "session"
-    legend = axes[0].get_legend()
-    assert legend is not None
+    [legend] = axes[0].figure.legends
     assert [one.get_text() for one in legend.get_texts()][:2] == ["s01", "s02"]
 
 
@@ -231,25 +229,71 @@ def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, 
     plt.close(new)
 
 
-def test_panels_of_a_narrow_figure_stand_below_each_other(recording, driver):
+@pytest.mark.parametrize(
+    ("name", "height", "rows"),
+    [
+        ("recording", 3.6, 2),
+        ("recording_with_current", 6.0, 4),
+        ("fit", 3.6, 2),
+        ("fit_impedance", 6.0, 3),
+        ("fit_residual", 6.0, 3),
+        ("measured_impedance", 6.0, 3),
+        ("selection", 6.0, 4),
+        ("calibration", 3.6, 2),
+        ("impedances", 4.0, 2),
+        ("fits", 6.0, 3),
+        ("posterior", 3.6, 3),
+        ("profile", 2.6, 1),
+        ("bound", 2.6, 1),
+    ],
+)
+def test_a_picture_for_a_column_of_a_paper_is_whole_and_clear(name, height, rows, monkeypatch):
     import matplotlib.pyplot as plt
 
-    fit = pictures.fit()
-    calls: list[tuple[Any, Any, tuple[float, float], int]] = [
-        ([recording], "pulse", (3.3, 3.6), 2),
-        ([recording], "pulse", (6.6, 3.6), 1),
-        ([fit, recording, driver], "impedance", (3.3, 6.0), 3),
-        ([fit, recording, driver], "residual", (12.0, 4.0), 1),
-    ]
-    for of, show, size, rows in calls:
-        axes = etid.plot(*of, show=show, size=size, title=None)
-        figure = axes[0].figure
-        figure.canvas.draw()
-        assert len({round(axis.get_position().y0, 2) for axis in axes}) == rows
-        inches = figure.get_tightbbox()
-        assert inches.x0 > 0
-        assert inches.x1 < size[0]
-        plt.close(figure)
+    def narrow(*of, **options):
+        return etid.plot(*of, **options, size=(3.3, height), title=None)[0].figure
+
+    monkeypatch.setattr(pictures, "figure_of", narrow)
+    figure = pictures.PICTURES[name]()
+    plt.close(figure)
+    assert pictures.faults(figure) == []
+    assert len({round(axis.get_position().y0, 2) for axis in figure.axes}) == rows
+
+
+@pytest.mark.parametrize("show", ["pulse", "impedance", "residual"])
+def test_a_long_path_is_whole_and_hides_nothing(recording, driver, show):
+    path = "subject07/session02/dry/finger-left-index/12-repeat"
+    fit = pictures.fit("misfit")
+    figure = figure_of(fit, recording.replace(path=path), driver, show=show)
+    assert pictures.faults(figure) == []
+    assert path in title(figure.axes[0])
+
+
+@pytest.mark.parametrize("show", ["impedance", "residual"])
+def test_a_fit_without_elements_says_so_in_every_panel(recording, driver, show):
+    nothing = pictures.SKIN.with_log_values(jnp.full(3, jnp.nan))
+    figure = figure_of(pictures.fit("saturated", nothing), recording, driver, show=show)
+    assert "no success: saturated" in title(figure.axes[0])
+    assert [text.get_text() for axis in figure.axes for text in axis.texts] == ["no elements"] * 3
+
+
+def test_a_legend_on_axes_of_the_caller_stays_in_them(recording, driver):
+    figure, given = new_figure(2, 2, (9.0, 6.0))
+    etid.plot(pictures.fit(), recording, driver, axes=given[:, 0])
+    assert not figure.legends
+    legend = given[0, 0].get_legend()
+    assert legend is not None
+    assert legend.get_frame_on()
+
+
+def test_fits_outside_the_axis_and_fits_without_elements_are_told_apart():
+    fits = pictures.fits()
+    values = np.asarray(fits.circuit.values()).copy()
+    values[1] = np.nan
+    of = dataclasses.replace(fits.fit, circuit=etid.SkinRC(*jnp.asarray(values.T)))
+    axis = figure_of(dataclasses.replace(fits, fit=of)).axes[0]
+    [told] = [one.get_text() for one in axis.texts if "without" in one.get_text()]
+    assert told == "1 without success outside, 1 without elements"
 
 
 def test_the_residual_of_a_wrong_circuit_correlates_with_the_unloaded_voltage(recording, driver):

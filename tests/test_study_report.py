@@ -140,6 +140,16 @@ def test_worst_fits_are_drawn_with_what_was_measured(page):
     assert "has changed" not in text
 
 
+def test_fits_from_a_current_are_drawn_beside_an_unloaded_voltage_too(found):
+    recording = pictures.with_current()
+    fits = fits_of([1.0], ["successful"], path=np.array([recording.path]))
+    by_current = dataclasses.replace(found, fits=fits, drivers={}, failures={})
+    shown = picture(by_current, etid.Study.from_recordings([recording]), 0, "")
+    assert shown is not None
+    assert "predicted" in shown.alt
+    assert "No prediction" not in shown.caption
+
+
 def test_recordings_are_looked_for_where_they_were_and_beside_the_fits(found, study_file, tmp_path):
     def look(given=None, fits=found):
         study, problem = find(fits, tmp_path / "fits.h5", given)
@@ -248,7 +258,31 @@ def test_one_recording_and_an_infinite_element_tell_no_spread(values, subjects):
         assert np.isnan(one.parts["between recordings"])
         assert list(one.parts.values())[2:] == pytest.approx([OWN, SHARED])
     for row in tables.show_components(found, fits.circuit.units()).rows:
-        assert row[6:] == ("", "", "1", "2")
+        assert row[6:] == ("", "", "1.0", "2.0")
+
+
+def test_the_variation_between_subjects_is_relative_to_the_median_that_the_table_prints():
+    subjects = np.array(["a", "b", "c", "c", "c"])
+    fits = fits_of([1.0, 2.0, 4.0, 4.0, 4.0], ["successful"] * 5, subject=subjects)
+    for one in tables.components(fits, fits.summary("subject", "condition")):
+        between = np.std([1.0, 2.0, 4.0], ddof=1) * TRUE[one.name]
+        assert one.parts["between subjects"] * one.median == pytest.approx(between)
+
+
+def test_figures_of_a_report_are_whole_and_clear(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "svg", lambda figure: drawn.append(figure) or b"")
+    fits = fits_of(
+        np.linspace(1.0, 1.3, 12), ["successful"] * 12, subject=np.repeat(["a", "b"], 6),
+        condition=np.array(["dry", "damp", "after washing"] * 4),
+    )  # fmt: skip
+    figures.quality(np.linspace(0.9, 1.03, 5), np.linspace(3.19e-3, 3.34e-3, 5))
+    figures.distributions(fits)
+    figures.by_subject(fits)
+    of_groups = tables.components(fits, fits.summary("subject", "condition"))
+    figures.components(of_groups, tables.frequent(fits, 4))
+    assert [pictures.faults(figure) for figure in drawn] == [[]] * 4
+    assert [len(figure.legends) for figure in drawn] == [0, 1, 1, 1]
 
 
 def test_the_worst_are_of_every_verdict_and_of_every_reason():
@@ -292,7 +326,10 @@ def test_a_file_with_an_element_of_zero_is_refused(tmp_path):
     [
         (tables.significant(0.01234), "0.012"),
         (tables.significant(123.4), "120"),
-        (tables.significant(5.0), "5"),
+        (tables.significant(5.0), "5.0"),
+        (tables.significant(186.0, 4), "186.0"),
+        (tables.significant(0.9999, 3), "1.00"),
+        (tables.significant(0.0), "0"),
         (tables.significant(3e7), "3.0e+07"),
         (tables.significant(np.nan), ""),
         (tables.significant(np.inf), ""),
@@ -369,6 +406,16 @@ def test_one_recording_gives_a_page_about_one_recording(tmp_path):
         assert of_others not in text
 
 
+def test_one_recording_without_elements_has_no_empty_numbers(tmp_path):
+    etid.write_report(fits_of([np.nan], ["saturated"]), tmp_path / "page.html")
+    read = _Read(tmp_path / "page.html")
+    assert "One recording, loaded/0, without success: saturated." in read.text
+    assert "The fit is no success: saturated." in read.text
+    assert "medians" not in read.text
+    assert "is ;" not in read.text
+    assert "table" not in read.elements
+
+
 CITED = {  # what a reader sees, and the key of the entry that it must have
     "Pintelon and Schoukens, 2012": "pintelon2012",
     "Ljung, 1999": "ljung1999",
@@ -415,6 +462,25 @@ def test_the_budget_is_that_of_the_fit_with_the_median_error(tmp_path):
             [table] = section.tables
             assert table.rows == tuple(wanted._overview().rows)
         assert budgets(found, None) == []
+
+
+@pytest.mark.parametrize("method", ["maximum_likelihood", "output_error", "joint", TWO])
+def test_methods_of_fits_from_a_current_tell_of_no_driver(found, method):
+    fits = dataclasses.replace(found.fits, fit=dataclasses.replace(found.fits.fit, method=method))
+    by_current = dataclasses.replace(found, fits=fits, drivers={}, failures={})
+    section = methods.methods_section(by_current)
+    for words in ("Z_th", "driver", "calibration", "resistors", "joint", "gains", "McBride"):
+        assert words not in section.text + section.details
+    assert "scales of current and voltage" in section.details
+    assert "steiglitz1965" not in section.code
+
+
+def test_methods_count_the_calibrations(found):
+    alone = dataclasses.replace(found, failures={})
+    for of, calibrations in ((alone, "a calibration"), (found, "calibrations")):
+        words, section = f"from {calibrations} with a known", methods.methods_section(of)
+        assert words in section.text
+        assert words in section.details
 
 
 @pytest.mark.parametrize("method", [*registry.names(), "joint", "online", TWO])

@@ -79,7 +79,9 @@ class Description:
     Attributes:
         words: Name of the estimator in a sentence.
         text: Sentences that state what was estimated, and how.
+        behind: Further sentences about loads behind a driver, not those from a measured current.
         conditions: Conditions that a successful fit meets.
+        behind_conditions: Further conditions that a successful fit behind a driver meets.
         of_driver: Further conditions that an identified driver meets.
         errors: How the standard errors were computed, as the end of a sentence; empty without
             standard errors.
@@ -90,7 +92,9 @@ class Description:
 
     words: str
     text: str
+    behind: str = ""
     conditions: tuple[str, ...] = CHECKED
+    behind_conditions: tuple[str, ...] = ()
     of_driver: tuple[str, ...] = ()
     errors: str = ""
     refined: bool = False

@@ -21,8 +21,6 @@ from etid.results.posterior import Posterior, Profile
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
 
-NARROW = 2.0  # [inch] panels side by side that would be narrower stand below each other
-
 Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -81,7 +79,8 @@ def plot(
 
     The points of `show="impedance"` are what the recording measures in bands of frequency, with two
     standard errors. `show="residual"` adds the autocorrelation of the residual and its
-    cross-correlation with V_th; of white noise, 99 % lie in the band.
+    cross-correlation with V_th; of white noise, 99 % lie in the band. Aliases of the edges
+    exceed it, too.
 
     The picture of a selection shows magnitude [kΩ] and phase [deg] in bands of frequency with two
     standard errors; points are pale where the error exceeds 30 %. Below are the deviations of each
@@ -103,7 +102,7 @@ def plot(
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
         size: Width and height of this figure [inch]; if not given, one for a screen. In a narrow
-            one, panels stand below each other.
+            one, panels stand below each other, but for those of a posterior.
         title: Replaces the titles of the picture; None leaves them out, as a paper does.
 
     Returns:
@@ -121,15 +120,14 @@ def plot(
     given = None if axes is None else np.asarray(axes, dtype=object).ravel()
 
     def canvas(rows: int, columns: int, usual: tuple[float, float], **options: Any) -> np.ndarray:
-        if size is not None and rows == 1 < columns and size[0] < NARROW * columns:
-            rows, columns = columns, 1  # as in the column of a paper
         if given is None:
             return new_figure(rows, columns, size or usual, pyplot=True, **options)[1]
         if given.size != rows * columns:
             raise ValueError(f"axes holds {given.size} Axes; this picture takes {rows * columns}")
         return given.reshape(rows, columns)
 
-    drawn = _draw(canvas, x, recording, driver, show=show, by=by, map=map, layout=layout)
+    wide = np.inf if size is None else size[0]
+    drawn = _draw(canvas, x, recording, driver, show=show, by=by, map=map, layout=layout, wide=wide)
     if title != "":
         for axis in drawn.flat:
             axis.set_title("", loc="left")
@@ -160,6 +158,7 @@ def _draw(
     by: Sequence[str] | None = None,
     map: str | None = None,
     layout: "Layout | str | os.PathLike[str] | None" = None,
+    wide: float = np.inf,
 ) -> np.ndarray:
     import matplotlib as mpl
 
@@ -217,7 +216,7 @@ def _draw(
             case Fits(), None, None if map is not None:
                 places = FINGERTIP if layout is None else layout
                 places = places if isinstance(places, Layout) else read_layout(places)
-                return maps.draw_map(canvas, x, map, places)
+                return maps.draw_map(canvas, x, map, places, wide)
             case Fits(), None, None:
                 return elements.draw_fits(canvas, x, by or ("subject", "condition"))
             case Posterior(), None, None:

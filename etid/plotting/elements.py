@@ -2,11 +2,9 @@
 
 import statistics
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 
 from etid.circuits.display import DISPLAY
 from etid.plotting.style import (
@@ -14,10 +12,12 @@ from etid.plotting.style import (
     COLOURS,
     INK,
     MARKS,
+    NARROW,
     RED,
     Canvas,
     drawable,
     key,
+    legend,
     nth,
     plain,
     plain_ticks,
@@ -86,11 +86,12 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
             axis.set_ylim(low, high)
             shown = known & (values > low) & (values < high)
         plain_ticks(axis.yaxis)
-        if not shown.all():
-            axis.text(
-                0.995, 0.97, f"{(~shown).sum()} without success outside", color=RED, fontsize=8,
-                transform=axis.transAxes, ha="right", va="top",
-            )  # fmt: skip
+        hidden = {"without success outside": known & ~shown, "without elements": ~known}
+        told = [f"{of.sum()} {where}" for where, of in hidden.items() if of.any()]
+        axis.text(
+            0.995, 0.97, ", ".join(told), color=RED, fontsize=8, transform=axis.transAxes,
+            ha="right", va="top",
+        )  # fmt: skip
         if len(fits) <= 40 and axis.figure.get_figwidth() > 5:  # room for the names of the trials
             for row in np.flatnonzero(shown):
                 axis.annotate(
@@ -99,10 +100,10 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
                 )  # fmt: skip
         axis.set_ylabel(symbol(name, unit))
     names = [plain(one) or "-" for one in groups.tolist()]
-    turned = sum(map(len, names)) > 60
+    turned = sum(map(len, names)) > 8 * axes[-1].figure.get_figwidth()
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
     axes[-1].set_xlabel(by[0])
-    _legend(axes[0], series, "" if good.all() else "without success", ncols=4)
+    _legend(axes, list(map(plain, series)), "" if good.all() else "without success")
     counted = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
     lines = [f"{len(fits)} fits: {counted}; bars: one standard error"]
     if summary:
@@ -111,13 +112,12 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     return axes
 
 
-def _legend(axis: Axes, series: Sequence[str], hollow: str, **place: Any) -> None:
+def _legend(axes: np.ndarray, series: Sequence[str], hollow: str) -> None:
     """A legend with one entry per series, and one entry that explains hollow points."""
     entries = [key(name, nth(MARKS, i), nth(COLOURS, i)) for i, name in enumerate(series) if name]
     if hollow:
         entries.append(key(hollow, "o", hollow=True))
-    if entries:
-        axis.legend(handles=entries, **place)
+    legend(axes, entries)
 
 
 def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
@@ -145,11 +145,11 @@ def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
             "(100 % or more)"
         )
     plain_ticks(axis.xaxis)
-    axis.set_xlabel("smallest relative standard error [%]")
+    axis.set_xlabel("smallest standard error [%]")
     axis.set_yticks(range(len(bounds)), [plain(one.path) or "-" for one in bounds])
     axis.set_ylim(len(bounds) - 0.5, -0.5)
-    beside = {"loc": "upper left", "bbox_to_anchor": (1, 1)}
-    _legend(axis, names, "undetermined" if undetermined else "", **beside)
+    named = [symbol(name, "1") for name in names]
+    _legend(axes, named, "undetermined" if undetermined else "")
     titled(axis, lines, good=not undetermined)
     return axes
 
@@ -158,7 +158,8 @@ def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
     """Histograms of the elements, diagrams of each two, and the normal distribution of the fit."""
     units = posterior.circuit.units()
     count = len(units)
-    grid = canvas(count, count, (2.4 * count + 0.6, 2.2 * count + 0.4))
+    grid = canvas(count, count, (2.4 * count + 0.6, 2.2 * count + 0.4), matrix=True)
+    narrow = grid[0, 0].figure.get_figwidth() < NARROW * count
     scales = np.array([DISPLAY[unit][0] for unit in units.values()])
     labels = [symbol(name, unit) for name, unit in units.items()]
     draws = np.asarray(posterior.draws.values()).T / scales[:, None]
@@ -177,6 +178,7 @@ def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
                 continue
             axis.set_xlim(low[column], high[column])
             axis.locator_params(axis="x", nbins=4)
+            axis.tick_params(axis="x", labelrotation=90 if narrow else 0)
             if column == row:
                 bins = np.linspace(low[row], high[row], 30).tolist()
                 look = {"density": True, "color": BLUE, "alpha": 0.7}
@@ -197,7 +199,7 @@ def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
             axis.tick_params(labelbottom=row == count - 1, labelleft=column == 0)
             if row == count - 1:
                 axis.set_xlabel(labels[column])
-    grid[0, 0].plot([], [], color=RED, lw=1.2, label="fit ± standard error")
+    grid[0, 0].plot([], [], color=RED, lw=1.2, label="errors of the fit\n(ellipses: 95 %)")
     grid[0, 0].legend(loc="upper left", bbox_to_anchor=(1.02, 1)).set_in_layout(False)
     title = f"{posterior.weights.size} draws, worth {posterior.effective:.0f}; shaded: 95 %"
     titled(grid[0, 0], [title])
@@ -234,5 +236,5 @@ def draw_profile(canvas: Canvas, profile: Profile) -> np.ndarray:
         xlabel=symbol(profile.name, profile.unit), ylabel="deviance", ylim=(0.0, 10.0),
         xlim=(values[0], values[-1]),
     )  # fmt: skip
-    axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+    legend(axes)
     return axes

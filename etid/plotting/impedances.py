@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from etid.circuits.circuit import AbstractCircuit
 from etid.numpy_tier.tiers import program
 from etid.plotting import Impedance
-from etid.plotting.style import COLOURS, DASHES, Canvas, nth, plain_ticks, titled, typeset
+from etid.plotting.style import COLOURS, DASHES, Canvas, legend, nth, plain_ticks, titled, typeset
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.solvers.matrices import log_stderr
@@ -45,7 +45,7 @@ def draw_bode(canvas: Canvas, things: Mapping[str, Impedance]) -> np.ndarray:
             phase.fill_between(kilohertz, *np.degrees([angle - turn, angle + turn]), **band)
     phase.set(xlabel="frequency [kHz]")
     frame(magnitude, phase, np.concatenate(sizes))
-    magnitude.legend()
+    legend(axes)
     titled(magnitude, failed or ["bands: two standard errors" if banded else ""], good=not failed)
     return axes
 

@@ -24,9 +24,11 @@ from etid.plotting.style import (
     RED,
     Canvas,
     judged,
+    legend,
+    listed,
     nth,
-    titled,
     typeset,
+    without_elements,
 )
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
@@ -42,11 +44,23 @@ def draw_impedance(
     canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None
 ) -> np.ndarray:
     """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
+    if not listed(fit):
+        return _empty(canvas, fit, recording.path)
     recording, known = _in_bands(recording, driver)
     measured = bands(Harmonics.of(Inspected(recording)), known, fit.circuit)
     clear = measured.stderr <= CLEAR
     points = measured.frequency[clear], measured.z[clear], measured.stderr[clear]
     return _diagrams(canvas, fit, recording.path, *points)
+
+
+def _empty(canvas: Canvas, fit: Fit, path: str) -> np.ndarray:
+    """Three panels of a fit without elements."""
+    axes = canvas(1, 3, (12.0, 3.8)).ravel()
+    for axis in axes:
+        without_elements(axis)
+        axis.set(xticks=[])
+    judged(axes[0], path, fit)
+    return axes
 
 
 def draw_measured(canvas: Canvas, fit: Fit, measured: MeasuredImpedance) -> np.ndarray:
@@ -81,9 +95,8 @@ def _diagrams(
     for axis in (magnitude, phase):
         axis.set(xlabel="frequency [kHz]")
     magnitude.xaxis.set_major_formatter("{x:g}")
-    magnitude.legend()
-    judged(nyquist, path, fit)
-    titled(magnitude, [",  ".join(fit.elements)], good=fit.verdict == "successful")
+    legend(axes)
+    judged(nyquist, path, fit, *listed(fit))
     return axes
 
 
@@ -109,18 +122,20 @@ def draw_residual(
 
     A residual of white noise has correlations within the band at 99 % of the lags.
     """
-    whole, own, with_input = axes = canvas(1, 3, (12.0, 3.4)).ravel()
+    if not listed(fit):
+        return _empty(canvas, fit, recording.path)
+    whole, own, with_input = axes = canvas(1, 3, (12.0, 3.8)).ravel()
     residual = predict(recording, driver, fit.circuit) - recording.v_out
     known = np.isfinite(residual)
     whole.plot(1e3 * recording.time, 1e3 * residual, color=BLUE, lw=0.5)
     whole.set(xlabel="time [ms]", ylabel="residual [mV]")
     cause = fed(recording, driver)[0].cause
     clean, cause_known = residual[known], recording.samples[cause].values[known]
-    _correlation(own, clean, clean, "autocorrelation of the residual")
+    _correlation(own, clean, clean, "autocorrelation\nof the residual")
     name = typeset("V_th") if cause == "v_th" else "current"
-    _correlation(with_input, clean, cause_known, f"correlation with earlier {name}")
+    _correlation(with_input, clean, cause_known, f"correlation\nwith earlier {name}")
     judged(whole, recording.path, fit)
-    titled(own, ["band: 99 % of white noise"])
+    legend(axes, own.get_legend_handles_labels()[0])
     return axes
 
 
@@ -140,7 +155,8 @@ def _correlation(
         for lag in lags
     ]
     band = 2.58 / np.sqrt(size)
-    axis.axhspan(-band, band, color="0.85", lw=0)
+    band_label = "99 % of white noise (aliases of the edges exceed it)"
+    axis.axhspan(-band, band, color="0.85", lw=0, label=band_label)
     axis.vlines(lags, 0.0, np.array(products) / norm, color=INK, lw=0.9)
     axis.set(xlabel="lag [samples]", ylabel=label)
 
@@ -152,9 +168,9 @@ def draw_selection(
     ratios = {"height_ratios": [3, 1.6]}
     axes = canvas(2, 2, (9.0, 5.2), sharex=True, gridspec_kw=ratios).ravel()
     chosen = selection.candidates[0]
-    fitted = [one for one in selection.candidates if np.isfinite(one.fit.circuit.values()).all()]
+    fitted = [one for one in selection.candidates if listed(one.fit)]
     if chosen not in fitted:
-        axes[0].text(0.5, 0.5, "no elements", color=RED, transform=axes[0].transAxes, ha="center")
+        without_elements(axes[0])
         judged(axes[0], recording.path, selection.fit)
         return axes
     recording, known = _in_bands(recording, driver)
@@ -165,8 +181,8 @@ def draw_selection(
     found = [bands(lane, known, one.fit.circuit) for one in fitted]
     _measured_and_fitted(axes[0], axes[1], fitted, found[0])
     _deviations(axes[2], axes[3], found)
-    elements = ",  ".join(selection.fit.elements)
-    judged(axes[0], recording.path, selection.fit, chosen.name, elements)
+    legend(axes)
+    judged(axes[0], recording.path, selection.fit, chosen.name, *listed(selection.fit))
     return axes
 
 
@@ -201,7 +217,6 @@ def _measured_and_fitted(
         sizes.append(np.abs(z) / 1e3)
         curve(magnitude, phase, frequency, z, label=label, **_look(number))
     frame(magnitude, phase, np.concatenate(sizes))
-    magnitude.legend(loc="lower left")
 
 
 def _deviations(magnitude: Axes, phase: Axes, found: list[Bands]) -> None:
@@ -214,7 +229,7 @@ def _deviations(magnitude: Axes, phase: Axes, found: list[Bands]) -> None:
         for number, of in enumerate(found):
             look = _look(number) | {"marker": nth(MARKS, number), "ms": 3.0}
             axis.plot(of.frequency / 1e3, of.deviation[part], **look)
-        axis.set(xlabel="frequency [kHz]", ylabel=f"measured - fitted\n{name} [stderr]")
+        axis.set(xlabel="frequency [kHz]", ylabel=f"deviation of\n{name} [stderr]")
         axis.set_yscale("symlog", linthresh=plain, linscale=1.0)
         ticks = [tick for tick in (2.0, 10.0, 100.0, 1000.0, 10000.0) if tick <= largest]
         axis.yaxis.set_major_locator(FixedLocator([*(-t for t in ticks), 0.0, *ticks]))

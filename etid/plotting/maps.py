@@ -11,9 +11,11 @@ from etid.plotting.layout import Layout
 from etid.plotting.style import (
     INK,
     MARKS,
+    NO_BREAK,
     Canvas,
     drawable,
     key,
+    legend,
     nth,
     plain,
     plain_ticks,
@@ -25,14 +27,24 @@ from etid.results.fits import Fits
 COLOURS = "cividis"  # readers with and without red-green blindness see it alike
 BY = ("subject", "session", "site", "condition")  # a map for each combination
 ROW = 6  # maps side by side
+LEAST = 1.5  # [inch] width of a map
 DOT = 0.9  # diameter of an electrode, relative to the distance of neighbours
 
 
-def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.ndarray:
+def draw_map(
+    canvas: Canvas, fits: Fits, element: str, layout: Layout, wide: float = np.inf
+) -> np.ndarray:
     """An element at each electrode, a map for each subject, session, site and condition.
 
     The colour is the median of the successful trials of an electrode, on one logarithmic scale for
     all maps. An electrode without a successful trial has a mark of its own for each verdict.
+
+    Args:
+        canvas: Makes the axes.
+        fits: The fits.
+        element: Name of the element.
+        layout: Places of the electrodes.
+        wide: Width of the figure [inch], if it is given; a narrow one has fewer maps in a row.
 
     Raises:
         ValueError: There is no such element, or an electrode has no place.
@@ -48,12 +60,12 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     norm = LogNorm(*(_round(values[good]) if good.any() else (1.0, 10.0)))
     bad = sorted({str(verdict) for verdict in fits.verdicts[~good]} - {"successful"})
     marks = {verdict: nth(MARKS[1:], number) for number, verdict in enumerate(bad)}
-    columns = min(ROW, len(groups))
+    columns = min(len(groups), max(1, int(min(wide / LEAST, ROW))))
     rows = -(-len(groups) // columns)
     width, height = np.ptp(layout.x), np.ptp(layout.y)
     tall = 1.7 * min(max(height / max(width, 1e-9), 0.5), 4.0)
     size = (2.0 * columns + 1.4, (tall + 0.9) * rows + 0.4)
-    axes = canvas(rows, columns, size, sharex=True, sharey=True)
+    axes = canvas(rows, columns, size, matrix=True, sharex=True, sharey=True)
     for axis, group in zip(axes.flat, groups, strict=False):
         of = np.array([one == group for one in keys])
         shown = np.unique(place[of & good])
@@ -65,21 +77,20 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
             at, mark = (1e3 * layout.x[one], 1e3 * layout.y[one]), marks.get(verdict, "x")
             axis.plot(*at, mark, ms=6, color=INK, mfc="white")
         count = f"{shown.size} of {shown.size + failed.size} electrodes"
-        titled(axis, [plain(", ".join(filter(None, group))), count])
+        name = ", ".join(plain(one).replace(" ", NO_BREAK) for one in group if one)
+        titled(axis, [name, count], beside=True)
     for axis in axes.flat[len(groups) :]:
         axis.set_axis_off()
-    for axis in axes[-1]:
+    for axis in axes.flat[max(0, len(groups) - columns) : len(groups)]:  # the last of each column
         axis.set_xlabel("x [mm]")
+        axis.tick_params(labelbottom=True)
     for axis in axes[:, 0]:
         axis.set_ylabel("y [mm]")
+    legend(axes, [key(name, mark, hollow=True) for name, mark in marks.items()])
     figure = axes.flat[0].figure
     bar = figure.colorbar(ScalarMappable(norm, COLOURS), ax=axes, shrink=0.6, pad=0.02)
     bar.set_label(symbol(element, units[element]))
     plain_ticks(bar.ax.yaxis)
-    if marks:
-        handles = [key(name, mark, hollow=True) for name, mark in marks.items()]
-        place = {"loc": "outside lower center", "ncols": 4}
-        figure.legend(handles=handles, markerscale=1.5, **place)
     return axes.ravel()
 
 

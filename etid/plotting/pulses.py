@@ -7,7 +7,19 @@ from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.circuits.display import heading, scaled
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
-from etid.plotting.style import BLUE, INK, RED, Canvas, judged, plain, titled, typeset
+from etid.plotting.style import (
+    BLUE,
+    INK,
+    RED,
+    Canvas,
+    judged,
+    legend,
+    listed,
+    plain,
+    titled,
+    typeset,
+    without_elements,
+)
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
@@ -57,17 +69,17 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
     labels = [f"{name} {value}" for name in LABELS if (value := getattr(recording, name))]
     if recording.r_load is not None:
         labels.append(f"calibration with {recording.r_load / 1e3:g} kΩ")
-    titled(axes[0, 0], [plain(recording.path), plain(", ".join(labels))])
-    titled(axes[0, 1], ["one pulse"])
-    axes[0, 1].legend(fontsize="medium")
+    titled(axes[0, 0], [plain(recording.path), plain(", ".join(labels))], beside=True)
+    titled(axes[0, 1], ["one pulse"], beside=True)
+    legend(axes)
     return axes.ravel()
 
 
 def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None) -> np.ndarray:
     """Measured and predicted pulse, the residual, and the verdict of the fit as title."""
-    known = np.isfinite(np.asarray(fit.circuit.values())).all()
-    axes = _pulse_and_residual(canvas, recording, driver, fit.circuit if known else None)
-    judged(axes[0], recording.path, fit, ",  ".join(fit.elements) if known else "")
+    elements = listed(fit)
+    axes = _pulse_and_residual(canvas, recording, driver, fit.circuit if elements else None)
+    judged(axes[0], recording.path, fit, *elements)
     return axes
 
 
@@ -102,11 +114,7 @@ def _pulse_and_residual(
     upper.set(ylabel="voltage [V]")
     lower.set(xlabel="time [ms]", ylabel="residual [mV]")
     if load is None:
-        lower.text(
-            0.5, 0.5, "no elements, nothing predicted", color=RED, transform=lower.transAxes,
-            ha="center", va="center",
-        )  # fmt: skip
-        lower.set(yticks=[])
+        without_elements(lower, "no elements, nothing predicted")
     else:
         predicted = predict(recording, driver, load)
         upper.plot(time, predicted[part], "--", color=RED, lw=1.2, label="predicted")
@@ -116,9 +124,7 @@ def _pulse_and_residual(
         lower.axhspan(-2 * sigma, 2 * sigma, color="0.85", lw=0, label=label)
         lower.axhline(0.0, color="0.6", lw=0.6)
         lower.plot(time, 1e3 * (predicted - recording.v_out)[part], color=BLUE, lw=0.8)
-        # Noise fills these axes, so the legend is above them.
-        lower.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
-    upper.legend()
+    legend(axes, [one for axis in axes for one in axis.get_legend_handles_labels()[0]])
     return axes
 
 

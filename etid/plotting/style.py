@@ -9,6 +9,7 @@ import io
 import os
 import pathlib
 import re
+import textwrap
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,6 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -27,6 +29,11 @@ from etid.recordings.replacing import replacing
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 
+NARROW = 2.0  # [inch] columns of panels that would be narrower stand below each other
+TICKS = 1.3  # largest number of ticks over an inch: five digits have room between two
+NO_BREAK = "\u00a0"
+MARGIN = 0.75  # [inch] left of axes with labels, about
+EM = 0.55  # mean width of a character, relative to the size of the font
 INK = "#1a1a1a"
 BLUE = "#0b62a4"
 RED = "#c0392b"
@@ -60,15 +67,24 @@ Canvas = Callable[..., np.ndarray]
 
 
 def new_figure(
-    rows: int, columns: int, size: tuple[float, float], *, pyplot: bool = False, **options: Any
+    rows: int,
+    columns: int,
+    size: tuple[float, float],
+    *,
+    pyplot: bool = False,
+    matrix: bool = False,
+    **options: Any,
 ) -> tuple[Figure, np.ndarray]:
     """A figure with a light grid, and its axes [row, column].
+
+    In a narrow figure, as for the column of a paper, the columns of panels stand below each other.
 
     Args:
         rows: Number of rows of axes.
         columns: Number of columns of axes.
         size: Width and height [inch].
         pyplot: Whether `matplotlib.pyplot` knows the figure, so that a notebook shows it.
+        matrix: Whether the panels keep their places in a narrow figure, too.
         **options: Options of `Figure.subplots`.
     """
     make: Callable[..., Figure] = Figure
@@ -78,12 +94,80 @@ def new_figure(
         make = plt.figure
     with mpl.rc_context(PAPER):
         figure = make(figsize=size, layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False, **options)
+        if matrix or size[0] >= NARROW * columns:
+            axes = figure.subplots(rows, columns, squeeze=False, **options)
+        else:
+            axes = _stacked(figure, rows, columns, **options)
+            columns = 1
         for axis in axes.flat:
+            axis.locator_params(axis="x", nbins=int(np.clip(TICKS * size[0] / columns, 2, 9)))
             # matplotlib makes ticks later, and would then use the reader's style.
             axis.grid(True, color="0.9", linewidth=0.6)
             axis.tick_params(which="both", colors=INK)
     return figure, axes
+
+
+def _stacked(
+    figure: Figure, rows: int, columns: int, *, sharex: str | bool = False, **options: Any
+) -> np.ndarray:
+    """Panels below each other, a column after another, as axes [row, column]."""
+    ratios = options.pop("gridspec_kw", {}).get("height_ratios", [1.0] * rows)
+    axes = figure.subplots(rows * columns, 1, height_ratios=[*ratios] * columns, **options)
+    axes = axes.reshape(columns, rows).T
+    if sharex in (True, "all", "col"):
+        for *above, last in axes.T:
+            for axis in above:
+                axis.sharex(last)
+                axis.tick_params(labelbottom=False)
+    return axes
+
+
+def legend(axes: np.ndarray, handles: Sequence[Any] | None = None) -> None:
+    """A legend below a picture, with as many columns as have room.
+
+    On axes of the caller, whose figure may hold more or have no room, it is a frame in the first.
+
+    Args:
+        axes: All axes of the picture.
+        handles: Entries of the legend; if not given, those of the first axes.
+    """
+    first = axes.flat[0]
+    figure, size = first.figure, float(mpl.rcParams["legend.fontsize"])
+    handles = first.get_legend_handles_labels()[0] if handles is None else handles
+    if not handles:
+        return
+    own = isinstance(figure, Figure) and len(figure.axes) == axes.size
+    if not own or not isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
+        first.legend(handles=handles, frameon=True)
+        return
+    room, beside = figure.get_figwidth(), 5 * size / 72  # [inch] an entry has a mark and spaces
+    labels = [wrapped(str(one.get_label()), room - beside, size) for one in handles]
+    lengths = [max(map(len, _unset(label).split("\n"))) for label in labels]
+    widths = EM * size / 72 * np.array(lengths) + beside
+
+    def has_room(columns: int) -> bool:
+        return bool(sum(map(max, np.array_split(widths, columns))) <= room)
+
+    columns = next(filter(has_room, range(len(handles), 1, -1)), 1)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+
+
+def _unset(text: str) -> str:
+    """About what is seen of a text with formulas."""
+    return re.sub(r"\\[A-Za-z]+|[${}_]", "", text)
+
+
+def wrapped(text: str, inches: float, size: float) -> str:
+    """A text whose lines are broken where letters of this size [points] leave the room."""
+    count = max(8, int(72 * inches / (EM * size)))
+    lines = [textwrap.wrap(line, count, break_on_hyphens=False) for line in text.split("\n")]
+    return "\n".join(line for part in lines for line in part).replace(NO_BREAK, " ")
+
+
+def without_elements(axis: Axes, text: str = "no elements") -> None:
+    """Say in an empty panel why it is empty."""
+    axis.text(0.5, 0.5, text, color=RED, transform=axis.transAxes, ha="center", va="center")
+    axis.set(yticks=[])
 
 
 def nth(looks: Sequence[Any], number: int) -> Any:
@@ -94,7 +178,7 @@ def nth(looks: Sequence[Any], number: int) -> Any:
 def key(label: str, mark: str, colour: str = INK, *, hollow: bool = False) -> Line2D:
     """An entry of a legend: a mark with its meaning."""
     face = "white" if hollow else colour
-    return Line2D([], [], ls="", marker=mark, ms=4, color=colour, mfc=face, label=plain(label))
+    return Line2D([], [], ls="", marker=mark, ms=4, color=colour, mfc=face, label=label)
 
 
 def drawable(values: np.ndarray) -> np.ndarray:
@@ -141,10 +225,28 @@ def typeset(text: str) -> str:
     return _SYMBOL.sub(lambda found: symbol(found[0], "1"), text)
 
 
-def titled(axis: Axes, lines: Sequence[str], *, good: bool = True) -> None:
-    """Set a title on the left; red if the picture does not show a valid result."""
-    color = INK if good else RED
-    axis.set_title(typeset("\n".join(filter(None, lines))), loc="left", fontsize=9, color=color)
+def titled(axis: Axes, lines: Sequence[str], *, good: bool = True, beside: bool = False) -> None:
+    """Set a title on the left; red if the picture does not show a valid result.
+
+    Args:
+        axis: The first axes of the picture.
+        lines: Lines of the title; they are broken at the edge of the figure.
+        good: Whether the result is valid.
+        beside: Whether axes on the right have titles too, so that lines are broken before them.
+    """
+    panel, whole, dpi = axis.bbox, axis.figure.bbox, axis.figure.dpi
+    room = panel.width if beside else min(whole.x1 - panel.x0, whole.width - MARGIN * dpi)
+    text = wrapped("\n".join(filter(None, lines)), room / dpi, size := 9.0)
+    axis.set_title(
+        typeset(text), loc="left", fontsize=size, color=INK if good else RED, wrap=not beside
+    )
+
+
+def listed(fit: Fit) -> list[str]:
+    """The elements of a fit as a line of a title; empty if it has none."""
+    if not np.isfinite(np.asarray(fit.circuit.values())).all():
+        return []
+    return [",  ".join(one.replace(" ", NO_BREAK) for one in fit.elements)]
 
 
 def judged(axis: Axes, path: str, found: Fit | Driver, *more: str) -> None:
@@ -155,6 +257,7 @@ def judged(axis: Axes, path: str, found: Fit | Driver, *more: str) -> None:
         words.append(f"chi2 {chi2:.3g}")
     if np.isfinite(rrse := float(found.rrse)):
         words.append(f"RRSE {100 * rrse:.3g} %")
+    words = [one.replace(" ", NO_BREAK) for one in words]
     headline = ": ".join(filter(None, [plain(path), ", ".join(words)]))
     titled(axis, [headline, *more], good=good)
 

@@ -24,6 +24,7 @@ from etid.plotting.style import (
     MARKS,
     PAPER,
     drawable,
+    legend,
     new_figure,
     plain,
     plain_ticks,
@@ -60,8 +61,7 @@ def distributions(fits: Fits) -> bytes:
         axis.xaxis.set_major_locator(MaxNLocator(5))
         _widen(axis, *axis.dataLim.intervalx)
     axes[0, 0].set_ylabel("fits below [%]")
-    if axes[0, 0].lines:
-        axes[0, 0].legend()
+    legend(axes)
     return svg(figure)
 
 
@@ -135,7 +135,7 @@ def by_subject(fits: Fits) -> bytes:
     elif subjects.size > CROWD:
         last.set_xticks([])
     last.set_xlabel("subject" if named else "subjects")
-    axes[0, 0].legend(ncols=SERIES)
+    legend(axes)
     return svg(figure)
 
 
@@ -189,7 +189,7 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
         plain_ticks(axis.xaxis)
     axes[0, 0].set_yticks(range(len(parts)), parts)
     axes[0, 0].set_ylim(len(parts) - 0.5, -0.5)
-    axes[0, 0].legend()
+    legend(axes)
     return svg(figure)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import etid.identify.amplitudes
 import etid.identify.jointly
-import etid.online.state  # noqa: F401 - these modules describe their methods
+import etid.online.state  # these modules describe their methods
 from etid.circuits.display import quantity, several
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
@@ -33,11 +33,13 @@ def methods_section(found: StudyFits) -> Section:
     Args:
         found: The fits. If they have no settings, the section says what is missing.
     """
-    named = {name: described(name) for name in found.fits.fit.method.split(AND)}
+    named = {name: described(name) for name in _method(found).split(AND)}
     used = [one for one in named.values() if one is not None]
     by_driver = [described(driver.method) for driver in found.drivers.values()]
     of_drivers = [one for one in by_driver if one is not None]
-    cited = {"etid", "fingertip", "steiglitz1965", "jax2018"}
+    cited = {"etid", "fingertip", "jax2018"}
+    if not found.by_current:
+        cited.add("steiglitz1965")  # fits behind a driver start from it
     cited.update(key for one in (*used, *of_drivers) for key in one.cited)
     settings = found.settings
     if settings is not None and (settings.order == 0 or settings.candidates):
@@ -80,9 +82,17 @@ def _facts(
             f"{name} {quantity(value, unit)}"
             for (name, unit), value in zip(units, settings.start, strict=True)
         )
+    conditions = [c for one in used for c in one.conditions]
+    if not found.by_current:
+        conditions += [c for one in used for c in one.behind_conditions]
+        conditions += ["the driver was identified successfully"] if conditions else []
     continuous = [one for one in drivers if isinstance(one, ContinuousDriver)]
     r_load = {r for driver in continuous for r in driver.calibration.r_load.tolist()}
     resistors = ", ".join(f"{r / 1e3:.6g}" for r in sorted(r_load))
+    single = sum(map(len, [*found.drivers, *found.failures])) == 1
+    calibrations = "a calibration" if single else "calibrations"
+    calibrations += " with a known resistor" if len(r_load) == 1 else " with known resistors"
+    calibrations += f" of {resistors} kΩ" if resistors else ""
     return {
         "found": found,
         "settings": settings,
@@ -91,7 +101,7 @@ def _facts(
         "recordings": recordings,
         "circuit": type(fits.circuit).__name__,
         "formula": fits.circuit.formula,
-        "words": words(fits.fit.method),
+        "words": words(_method(found)),
         "automatic": fits.fit.method == joined([str(MAXIMUM_LIKELIHOOD), str(OUTPUT_ERROR)]),
         "version": importlib.metadata.version("etid"),
         "succeeded": succeeded(fits),
@@ -103,12 +113,19 @@ def _facts(
         "driver_methods": [words(one) for one in sorted({driver.method for driver in drivers})],
         "orders": sorted({driver.order for driver in drivers}),
         "continuous": bool(continuous),
-        "resistors": f"{resistors} kΩ" if resistors else "",
+        "calibrations": calibrations,
         "instrument": instrument,
         "r_load_uncertain": "r_load" in instrument,
-        "conditions": list(dict.fromkeys(c for one in used for c in one.conditions)),
+        "conditions": list(dict.fromkeys(conditions)),
         "of_driver": list(dict.fromkeys(c for one in of_drivers for c in one.of_driver)),
     }
+
+
+def _method(found: StudyFits) -> str:
+    """The method of the fits; a joint run that needed no driver identified each load alone."""
+    method = found.fits.fit.method
+    alone = found.by_current and method == etid.identify.jointly.METHOD
+    return str(MAXIMUM_LIKELIHOOD) if alone else method
 
 
 def _instrument(found: StudyFits) -> str:
@@ -128,6 +145,8 @@ def words(method: str) -> str:
 def succeeded(fits: Fits) -> str:
     """A sentence on the number of successful fits."""
     good = fits.counts().get("successful", 0)
+    if len(fits) == 1:
+        return "The fit is successful." if good else f"The fit is no success: {fits.verdicts[0]}."
     are = "is" if good == 1 else "are"
     share = f"{several(good, 'fit')} ({100 * good / len(fits):.1f} %)"
     return f"{share} {are} successful; only these enter medians and spreads."

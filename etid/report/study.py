@@ -110,7 +110,10 @@ def summary(found: StudyFits) -> str:
     if len(fits) == 1:
         path = str(fits.labels["path"][0])
         kind, method = type(fits.circuit).__name__, words(fits.fit.method)
-        return f"One recording, {path or 'without a path'}, identified as {kind} by {method}."
+        text = f"One recording, {path or 'without a path'}, "
+        if not np.isfinite(np.asarray(fits.circuit.values())).all():
+            return f"{text}without success: {fits.verdicts[0]}."
+        return f"{text}identified as {kind} by {method}."
     source = pathlib.Path(settings.source).name if settings is not None else ""
     text = f"{len(fits)} recordings{f' of {source}' if source else ''}"
     for name, field in DESCRIBING.items():
@@ -166,9 +169,10 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
     units = fits.circuit.units()
     text = (
         "Variations and errors, separated. Between subjects: standard deviation of the medians of "
-        "the subjects. Between recordings: variation between the recordings of one subject in one "
-        "condition without the noise, sqrt(spread² - own²), the median over subjects; 0 if noise "
-        "explains all of the spread. Own error: standard error from the noise of one recording. "
+        "the subjects, of the median of this table. The others are of the median of each subject, "
+        "and the median over subjects. Between recordings: variation between the recordings of one "
+        "subject in one condition without the noise, sqrt(spread² - own²); 0 if noise explains all "
+        "of the spread. Own error: standard error from the noise of one recording. "
         "Shared error: standard error from the driver. All recordings with that driver share it: "
         "the spread does not show it, and more trials do not reduce it. A cell is empty if the "
         "study cannot determine the number."
@@ -292,7 +296,10 @@ def _quality(fits: Fits) -> Section:
         pictures = (Picture(caption, drawn, alt, whole=True),)
     text = "All fits are successful."
     if failed:
-        text = f"{several(failed, 'fit')} without success; the table of recordings says why."
+        text = (
+            f"{several(failed, 'fit')} without success: the tables of verdicts and recordings say "
+            "why."
+        )
     return Section("Quality", text, (), pictures)
 
 
@@ -300,15 +307,19 @@ def _single(fits: Fits) -> Section:
     """The page about one recording begins with its verdict and its elements."""
     verdict = str(fits.verdicts[0])
     text = message(verdict) if verdict != "successful" else "The fit is successful."
-    text += (
-        f" χ² per degree of freedom is {study_tables.significant(float(fits.chi2[0]), 3)}; it is 1 "
-        "if the residual is noise. Own error: standard error from the noise of the recording. "
-        "Shared error: standard error from the driver."
-    )
+    if chi2 := study_tables.significant(float(fits.chi2[0]), 3):
+        text += f" χ² per degree of freedom is {chi2}; it is 1 if the residual is noise."
+    tables = ()
+    if np.isfinite(np.asarray(fits.circuit.values())).all():
+        text += (
+            " Own error: standard error from the noise of the recording. Shared error: standard "
+            "error from the driver."
+        )
+        tables = (study_tables.single(fits),)
     if verdict == "successful":
         text = f"{text} {fits[0].outside}".strip()  # in a note of `out_of_bounds` it stands already
     warning = own_part(verdict, str(fits.notes[0]))
-    return Section("Result", text, (study_tables.single(fits),), warning=warning)
+    return Section("Result", text, tables, warning=warning)
 
 
 def _recordings(fits: Fits, waveforms: Section) -> Section:

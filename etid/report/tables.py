@@ -31,7 +31,10 @@ def significant(value: float, digits: int = 2) -> str:
         return ""
     if abs(value) >= 1e6 or 0 < abs(value) < 1e-4:
         return f"{value:.{digits - 1}e}"
-    return np.format_float_positional(value, precision=digits, fractional=False, trim="-")
+    shown = np.format_float_positional(
+        value, precision=digits, min_digits=digits, fractional=False, trim="k"
+    )
+    return shown.removesuffix(".") if value else "0"
 
 
 def element(value: float, error: float, scale: float) -> str:
@@ -116,9 +119,10 @@ class Components:
         median: Median of the successful fits [SI].
         low: 5 % quantile of the successful fits [SI].
         high: 95 % quantile of the successful fits [SI].
-        parts: Standard deviation of the medians of the subjects, variation between the recordings
-            of one subject without noise, standard error from the noise of a recording, and that
-            from the driver, each relative to the median; NaN if the study cannot determine it.
+        parts: Standard deviation of the medians of the subjects relative to the median, and,
+            relative to the median of each subject, variation between the recordings of one subject
+            without noise, standard error from the noise of a recording, and that from the driver;
+            NaN if the study cannot determine it.
     """
 
     condition: str
@@ -157,7 +161,8 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
             values = np.asarray(getattr(chosen.circuit, name))
             low, high = np.quantile(values, [0.05, 0.95]).tolist()
             spread = float(np.std(medians, ddof=1)) if medians.size > 1 else math.nan
-            parts = {"between subjects": spread / float(np.median(medians))}
+            median = float(np.median(values))
+            parts = {"between subjects": spread / median}
             for label, part in (
                 ("between recordings", "between"), ("own error", "own"), ("shared error", "shared")
             ):  # fmt: skip
@@ -168,7 +173,7 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
                     name=name,
                     subjects=len(rows),
                     successful=values.size,
-                    median=float(np.median(values)),
+                    median=median,
                     low=low,
                     high=high,
                     parts=parts,
@@ -197,7 +202,7 @@ def show_components(found: Sequence[Components], units: Mapping[str, str]) -> Ta
     return Table(
         (*heads, "subjects", "recordings", "own", "shared"),
         tuple(rows),
-        (("", len(heads)), ("between, of the median [%]", 2), ("standard error [%]", 2)),
+        (("", len(heads)), ("between [%]", 2), ("standard error [%]", 2)),
     )
 
 

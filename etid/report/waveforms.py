@@ -79,10 +79,10 @@ def picture(found: StudyFits, study: Study, row: int, reason: str) -> Picture | 
         recording = study[path]
     except (RecordingError, KeyError):
         return None
-    by_current = recording.cause == "current"  # the fit needs no driver then
-    names = calibrations_of(found, study, recording)
-    driver = None if by_current else found.drivers.get(names)
-    figure, why = _predicted(recording, fit, driver)
+    # Such a fit needs no driver, also where the file has an unloaded voltage beside the current.
+    by_current = found.by_current or recording.cause == "current"
+    driver = None if by_current else found.drivers.get(calibrations_of(found, study, recording))
+    figure, why = _predicted(recording, fit, driver, by_current=by_current)
     elements = ", ".join(fit.elements)
     about = f"{path}: {fit.verdict}{f' ({reason})' if reason else ''}."
     alt = f"One pulse of {path}: measured, predicted and residual voltage. {elements}"
@@ -93,10 +93,12 @@ def picture(found: StudyFits, study: Study, row: int, reason: str) -> Picture | 
     return Picture(caption, svg(figure), alt, anchor=f"waveform-{row}")
 
 
-def _predicted(recording: Recording, fit: Fit, driver: Driver | None) -> tuple[Figure, str]:
+def _predicted(
+    recording: Recording, fit: Fit, driver: Driver | None, *, by_current: bool
+) -> tuple[Figure, str]:
     """A figure of one pulse, with its prediction or the reason why there is none."""
     values = np.asarray(fit.circuit.values())
-    if driver is None and recording.cause == "v_th":
+    if driver is None and not by_current:
         return figure_of(recording), "the fits hold no driver for it."
     if (values <= 0).any():
         return figure_of(recording), "an element is not positive."

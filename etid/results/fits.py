@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
-from etid.circuits.display import heading
+from etid.circuits.display import heading, several
 from etid.circuits.lookup import class_path
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.errors import install
@@ -205,7 +205,8 @@ class Fits(Overviewed, Generic[Circuit]):
             elements = [text for _, text, _ in element_rows(units, values, errors)]
             rows.append((where, f"{group['successful']}/{group['fits']}", *elements))
         return Overview(
-            f"{len(self)} fits of {type(self.circuit).__name__}: {counted(self.verdicts)}",
+            f"{several(len(self), 'fit')} of {type(self.circuit).__name__}: "
+            f"{counted(self.verdicts)}",
             rows,
             ("", "successful", *itertools.starmap(heading, units.items())),
             ("Median of the successful fits ± median standard error of one fit.",),
@@ -294,9 +295,9 @@ def _summary(fits: Fits, by: Sequence[str]) -> list[dict[str, Any]]:
             chosen = order[start:end]
             for part, values in parts.items():
                 row[name + part] = float(np.median(values[chosen])) if end > start else np.nan
-            several, values = chosen.size > 1, parts[""][chosen]
-            row[f"{name}_spread"] = float(np.std(values, ddof=1)) if several else np.nan
-            noise = float(np.mean(parts["_own"][chosen] ** 2)) if several else np.nan
+            more, values = chosen.size > 1, parts[""][chosen]
+            row[f"{name}_spread"] = float(np.std(values, ddof=1)) if more else np.nan
+            noise = float(np.mean(parts["_own"][chosen] ** 2)) if more else np.nan
             excess = np.square(row[f"{name}_spread"]) - noise
             row[f"{name}_between"] = float(np.sqrt(np.maximum(excess, 0.0)))
     return rows

@@ -32,25 +32,29 @@ from etid.results.fit import Fit
 from etid.results.instrument import Instrument
 
 
-def description(words: str, estimated: str, unknowns: str, tests: tuple[str, ...]) -> Description:
+def description(
+    words: str, estimated: str, unknowns: str, tests: tuple[str, ...], of_load: str = ""
+) -> Description:
     """Text about fits by maximum likelihood, alone or jointly.
 
     Args:
         words: Name of the estimator in a sentence.
         estimated: What was estimated, as the start of the sentence about the residual.
-        unknowns: Sentences about the unknowns.
+        unknowns: Sentences about the unknowns of fits behind a driver.
         tests: Score tests that a successful fit has passed.
+        of_load: Sentences about the unknowns of all fits.
     """
+    # In a fit from a measured current the elements take up any gain.
+    of_gain = tuple(one for one in tests if one == NO_OTHER_GAIN)
     return Description(
         words=words,
         text=f"{HARMONICS}{estimated} maximum likelihood with noise on both records (Pintelon and "
         "Schoukens, 2012, ch. 9): the residual Y - G exp(-jωτ) X of each loaded record Y and its "
-        "unloaded record X is weighted by its variance, var Y + |G|² var X, G = Z_L / (Z_L + "
-        f"Z_th). {unknowns}",
-        conditions=(
-            *CHECKED,
-            DETERMINED,
-            *tests,
+        f"unloaded record X is weighted by its variance, var Y + |G|² var X. {of_load}",
+        behind=unknowns,
+        conditions=(*CHECKED, DETERMINED, *(one for one in tests if one not in of_gain)),
+        behind_conditions=(
+            *of_gain,
             "recording and calibrations agree about Z_th (the calibrations' sum of squares grows "
             f"by at most {STRAINED:g})",
         ),
@@ -150,8 +154,8 @@ class MaximumLikelihood(AbstractEstimator):
             "maximum likelihood",
             "the load was estimated by",
             "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
-            "whose distribution the calibrations give. Its own trigger delay τ is one more "
-            f"unknown.{_BOTH if self.with_current else ''}{stated(self.known_elements)}"
-            f"{stated_limits(self.bounds)}",
+            f"whose distribution the calibrations give.{_BOTH if self.with_current else ''}",
             (NO_OTHER_CIRCUIT, NO_OTHER_GAIN, NO_FALL),
+            "The trigger delay τ of each recording is one more unknown."
+            f"{stated(self.known_elements)}{stated_limits(self.bounds)}",
         )
