@@ -2,8 +2,8 @@
 
 Both draw from the same likelihood (`benchmarks.rivals.posterior_by_numpyro`), by methods that share
 nothing else. numpyro is installed in an environment of its own. At 20 dB some recordings do not
-exclude that R_s is 0. Then the posterior has no end towards 0, and NUTS leaves the surroundings of
-the fit; such fits are counted and not compared.
+exclude that R_s is 0. Draws that the stretch would move below it have no weight here, and NUTS does
+not know it; such fits are counted and not compared.
 """
 
 import argparse

@@ -95,20 +95,23 @@ def test_a_profile_and_the_draws_give_one_interval_where_the_likelihood_is_skewe
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["dry", "damp"])
-def test_at_20_db_intervals_contain_the_truth(kind):
+def test_at_20_db_intervals_contain_the_truth_of_posterior_and_profile(kind):
     """Where R_s + R_p is known and R_s is not, a search in their logarithms finds two thirds."""
     scene = {"dry": etid.scenes.paper_dry, "damp": etid.scenes.paper_damp}[kind](snr_db=20.0)
     scene = dataclasses.replace(scene, trials=scene.trials[:1])
-    truth, covered = np.array(dataclasses.astuple(scene.trials[0].load)), []
+    load, covered = scene.trials[0].load, []
+    truth = np.array([load.r_s, load.r_p, load.c_p, load.r_s])  # the profile is of R_s
     for seed in range(100, 140):
         study = scene.simulate(seed=seed)
         driver = etid.identify_driver(study["calibration/98k8"], order=5, throw=False)
         fit = etid.identify_skin(next(study.loaded.recordings()), driver, throw=False)
         if fit.verdict == "successful":
-            ends = np.array(list(fit.posterior().intervals().values()))
-            covered.append((ends[:, 0] < truth) & (truth < ends[:, 1]))
+            ends = [*fit.posterior().intervals().values(), fit.profile("r_s").interval()]
+            low, high = np.array(ends).T
+            covered.append((low < truth) & (truth < high))
     assert len(covered) > 30
-    # Of 30 intervals of 95 %, less than 24 contain the truth in one of 4 000 tests.
+    # Of 30 intervals of 95 %, less than 24 contain the truth in one of 4 000 tests. In 60
+    # studies of dry skin the posterior has 84 % of R_s and 90 % of the others, the profile 93 %.
     assert (np.mean(covered, axis=0) >= 0.8).all(), np.mean(covered, axis=0)
 
 

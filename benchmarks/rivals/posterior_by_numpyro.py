@@ -29,9 +29,14 @@ ACCEPTED = 0.9  # of the proposals
 def drawn_by_nuts(pieces, mean, cov, seed):
     """Draws of q, in coordinates in which Laplace's approximation is a standard normal."""
     terms = posterior.terms_of(*pieces)
-    root = jnp.linalg.cholesky(cov)
+    root, powers = jnp.linalg.cholesky(cov), posterior.Impedances.of_circuit(pieces[2], mean).powers
+
+    def potential(u):
+        q = mean + root @ u
+        return posterior.cost(terms, q) - powers @ q  # the prior is uniform in the impedances
+
     kernel = NUTS(
-        potential_fn=lambda u: posterior.cost(terms, mean + root @ u),
+        potential_fn=potential,
         target_accept_prob=ACCEPTED,
     )
     chain = MCMC(kernel, num_warmup=WARM_UP, num_samples=DRAWS, progress_bar=False)
@@ -53,8 +58,11 @@ def compared(snr_db, seed):
     lane, known, wanted = posterior.given(fit, None, None)
     pieces = lane, known, fit.circuit
     mean, cov = map(np.asarray, posterior.minimum(*pieces))
-    q = drawn_by_nuts(pieces, mean, cov, seed)
-    theirs = posterior.stretched(q, mean, cov, wanted)
+    impedances = posterior.Impedances.of_circuit(fit.circuit, mean)
+    x = np.stack([impedances.of(q) for q in drawn_by_nuts(pieces, mean, cov, seed)])
+    slopes = impedances.powers[: len(wanted)]  # all elements of this skin are impedances
+    wanted = wanted * np.outer(slopes, slopes)
+    theirs = impedances.logs(posterior.stretched(x, *impedances.moments(mean, cov), wanted))
     ended = time.perf_counter()
     logs = np.log(np.asarray(ours.draws.values()))
     centre = ours.weights @ logs

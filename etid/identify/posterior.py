@@ -5,9 +5,9 @@ standard errors of a fit are those at the minimum. At low signal-to-noise ratios
 skewed, and its intervals are not symmetric.
 
 **Draws.** The parameters q are the logarithms of the elements, the trigger delay, and the uncertain
-part z of Z_th. F(q) = −log p has the curvature H at its minimum. The likelihood of damp skin knows
-R_s + R_p to 0.5 % at 20 dB, and R_s to 30 %: in the logarithms this is a curved valley. The draws are
-therefore of the impedances, R and 1/C, in which it is nearly straight. The first ones have the
+part z of Z_th. F(q) = −log p has the curvature H at its minimum. At 20 dB a record of damp skin
+determines R_s + R_p to 0.5 %, and R_s to 30 %: in the logarithms this is a curved valley. The draws
+are therefore of the impedances, R and 1/C, in which it is nearly straight. The first ones have the
 covariance H⁻¹ there (Laplace; `etid.solvers.importance_sampling`).
 
 The prior is uniform in these impedances above 0, and in the logarithms of elements that are none,
@@ -249,9 +249,8 @@ def posterior(
         raise ValueError(f"the recording does not determine all elements of {fit}")
     possible = weights > 0
     found = dict(zip(names, elements(x[possible]).T, strict=True))
-    return Posterior(
-        fit.circuit, np.asarray(fit.cov), type(fit.circuit)(**found), weights[possible]
-    )
+    circuit = type(fit.circuit)(**found)
+    return Posterior(fit.circuit, np.asarray(fit.cov), circuit, weights[possible])
 
 
 def given(

@@ -74,8 +74,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     inconsistent = (
         "Recording and calibrations contradict each other about the source impedance or the "
-        "unloaded voltage. Most likely the driver changed in between, or r_load is wrong: "
-        "calibrate again. Beside a driver, check the scale of a current too."
+        "unloaded voltage. The driver changed in between, r_load is wrong, or the load is another "
+        "circuit: try circuit='auto', or calibrate again. Beside a driver, check the scale of a "
+        "current too."
     )
     out_of_bounds = (
         "Recording and bounds contradict each other: without its bounds an element lies more than "
