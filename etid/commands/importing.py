@@ -5,6 +5,7 @@ The files may be .csv, .mat, .tdms, .abf, .npz, .wav, .lvm and .xlsx.
 
 import argparse
 import dataclasses
+import os
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
