@@ -124,7 +124,8 @@ A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Key
 
 - `v_th`, `v_out`: unloaded output, and output with the load. Each is a table with these keys:
     - `channel`: its name in the file; `FILE:NAME` is channel `NAME` of another file, whose path
-      begins in the current folder;
+      begins in the current folder. With a pattern such as `CH{electrode}` for `v_out`, each channel
+      that matches becomes the recording of an electrode, `path/1`, `path/2`, …;
     - `unit` of its values: `V`, `A` or `s`, with the prefix `k`, `m`, `u` or `µ`, `n`, `p`, or in
       words; needed unless the file contains it;
     - `scale` of this channel alone;
@@ -148,7 +149,9 @@ A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Key
   `path/E7/0`, `path/E7/1`, ….
 - `path` of the recording in the etid file. Several trials become `path/0`, `path/1`, …. Without a
   path, a single `[[recording]]` becomes `loaded/0`, …, or with `r_load` `calibration/0`, ….
-- FIELDS: as in the tables above. `trial` may be a list with one label per trial.
+- FIELDS: as in the tables above. `trial` may be a list with one label per trial. `calibration` may
+  name the `path` of a `[[recording]]` above it that becomes several calibrations: a recording gets
+  that of its own electrode, or all if they are trials of one.
 
 ### CSV
 

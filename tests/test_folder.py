@@ -130,14 +130,62 @@ def test_refusals_of_a_folder(folder, tmp_path, patterns, message):
         import_folder(folder, tmp_path / "study.h5", patterns, **OPTIONS)
 
 
+ARRAY = {"v_th": "open", "v_out": "CH{electrode}", "sample_rate": 18e3, "pulse_rate": 60.0}
+
+
+def array(path, *electrodes, part=0.1):
+    """A file with a channel for each electrode, whose number times `part` is its voltage."""
+    table = np.column_stack([pulses(1.0), *(pulses(part * n) for n in electrodes)])
+    header = ",".join(["open", *(f"CH{n}" for n in electrodes)])
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+    return path
+
+
 def test_each_channel_of_an_array_becomes_the_recording_of_an_electrode(tmp_path):
-    table = np.column_stack([pulses(1.0), *(pulses(0.1 * n) for n in (1, 2, 3))])
-    source, target = tmp_path / "array.csv", tmp_path / "study.h5"
-    np.savetxt(source, table, delimiter=",", header="open,CH1,CH2,CH3", comments="")
-    given = {"v_th": "open", "scale": 1.0, "sample_rate": 18e3, "pulse_rate": 60.0}
-    import_file(source, target, v_out="CH{electrode}", subject="s01", **given)
+    source, target = array(tmp_path / "array.csv", 1, 2, 3), tmp_path / "study.h5"
+    import_file(source, target, subject="s01", scale=1.0, **ARRAY)
     with etid.read(target) as study:
         assert [one.electrode for one in study.recordings()] == ["1", "2", "3"]
         np.testing.assert_allclose(study["loaded/3"].v_out, pulses(0.3))
     with pytest.raises(RecordingError, match=r"no channel matches 'E\{electrode\}'"):
-        import_file(source, target, v_out="E{electrode}", **given)
+        import_file(source, target, scale=1.0, **{**ARRAY, "v_out": "E{electrode}"})
+    import_file([source, array(tmp_path / "more.csv", 1)], target, scale=1.0, **ARRAY)
+    with etid.read(target) as study:
+        assert list(study) == [*(f"loaded/array/{n}" for n in (1, 2, 3)), "loaded/more/1"]
+
+
+@pytest.mark.parametrize(
+    ("electrodes", "own"), [((), ()), ((1, 2), ("98800/1", "98800/2")), ((2,), ("98800/2",) * 2)]
+)
+def test_each_electrode_of_an_array_gets_its_own_calibration_or_the_only_one(
+    electrodes, own, tmp_path
+):
+    root, target, again = tmp_path / "folder", tmp_path / "study.h5", tmp_path / "again.h5"
+    root.mkdir()
+    skin, known = array(root / "s01_07.csv", 1, 2), {}
+    if electrodes:
+        known[array(root / "cal_98k8.csv", *electrodes)] = 98.8e3
+    patterns = ("cal_{r_load}.csv", "{subject}_{trial}.csv")
+    found = import_folder(root, target, patterns, scale=1.0, **ARRAY)
+    assert "s01_07.csv → s01/07/1 … s01/07/2: subject s01, trial 07; 1000 samples" in str(found)
+    import_file(root, again, found.mapping)
+    assert target.read_bytes() == again.read_bytes()
+    import_file([skin, *known], again, calibrations=known, scale=1.0, **ARRAY)
+    with etid.read(target) as study, etid.read(again) as files:
+        named = [one.calibration for one in study.loaded.recordings()]
+        assert named == ([(f"calibration/{path}",) for path in own] or [(), ()])
+        by_name = [one.calibration for one in files.loaded.recordings()]
+        assert by_name == [tuple(n.replace("98800", "cal_98k8") for n in of) for of in named]
+
+
+def test_an_electrode_without_a_calibration_among_several_is_refused(tmp_path):
+    array(tmp_path / "cal_98k8.csv", 1, 2)
+    array(tmp_path / "s01_07.csv", 1, 3)
+    patterns = ("cal_{r_load}.csv", "{subject}_{trial}.csv")
+    message = (
+        "s01_07.csv, 's01/07/3', calibration: none of the 2 calibrations in 'calibration/98800'"
+        " has its electrode '3'"
+    )
+    with pytest.raises(RecordingError, match=message):
+        import_folder(tmp_path, tmp_path / "study.h5", patterns, scale=1.0, **ARRAY)
+    assert not (tmp_path / "study.h5").exists()

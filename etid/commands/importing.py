@@ -5,6 +5,7 @@ The files may be .csv, .mat, .tdms, .abf, .npz, .wav, .lvm and .xlsx.
 
 import argparse
 import dataclasses
+import os
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -135,7 +136,7 @@ def _folder(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Outcome:
     data = {
         "source": [folder],
         "target": arguments.target,
-        "recordings": sum(len(each.paths) for each in found.imported.values()),
+        "recordings": sum(len(each.paths) for of in found.imported.values() for each in of),
         **dataclasses.asdict(found),
     }
     return Outcome(str(found), data)

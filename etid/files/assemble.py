@@ -14,7 +14,7 @@ import numpy as np
 from etid.files.channel import UNITS, Channel, located, parse_unit
 from etid.files.clock import sample_rate
 from etid.files.mapping import KINDS, PAUSES, Plan, Signal
-from etid.recordings.fields import SIGNALS, Metadata, metadata_from
+from etid.recordings.fields import LABELS, SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, RecordingError
 from etid.recordings.splitting import firing, split
 
@@ -45,6 +45,7 @@ class Imported:
     """The sources of one imported recording, or of a stack of trials.
 
     Attributes:
+        file: The file.
         paths: HDF5 paths of the recordings.
         samples: Number of samples of each recording.
         sample_rate: Samples per second [Hz].
@@ -54,6 +55,7 @@ class Imported:
         notices: Signs that the file is not whole; empty if there are none.
     """
 
+    file: str
     paths: tuple[str, ...]
     samples: int
     sample_rate: float
@@ -100,15 +102,20 @@ class _Source(AbstractSource):
 
 
 def sources_of(
-    plan: Plan, channel: Callable[[str], Channel], file: str, by: str
+    plan: Plan,
+    channel: Callable[[str], Channel],
+    file: str,
+    by: str,
+    known: Mapping[str, Metadata],
 ) -> tuple[dict[str, AbstractSource], Imported]:
     """The recordings of a plan by path, and a summary of their sources.
 
     Args:
         plan: Plan of one recording or one stack of trials, from a mapping.
         channel: Function that returns the channel of a name.
-        file: Path of the file, for errors.
+        file: Path of the file.
         by: Source of the plan, for errors: `mapping` or `command`.
+        known: The calibrations that the plan can name, by path.
     """
     channels: dict[str, Channel] = {}
     used: dict[str, Used] = {}
@@ -153,14 +160,47 @@ def sources_of(
             own["electrode"] = electrodes[index]
             path = f"{plan.path}/{electrodes[index]}/{trials[index]}"
         metadata = metadata_from(**{**vars(common), **own, "path": path})
+        metadata = dataclasses.replace(metadata, calibration=_calibrations(metadata, known))
         th = records.get("v_th")
         unloaded = (file, path) if th is None else (file, th[0].name, th[1])
         sources[path] = _Source(tuple(layout), unloaded, file, metadata, records)
     samples = parts[0].stop - parts[0].start if parts else length
     notices = tuple(dict.fromkeys(own.notice for own in channels.values() if own.notice))
     return sources, Imported(
-        tuple(sources), samples, rate, rate_by, common.pulse_rate, used, notices
+        file, tuple(sources), samples, rate, rate_by, common.pulse_rate, used, notices
     )
+
+
+def _calibrations(of: Metadata, known: Mapping[str, Metadata]) -> tuple[str, ...]:
+    """Paths of the calibrations of a recording.
+
+    A path that it names may be that of a `[[recording]]` that became several calibrations. Where
+    their labels differ, as those of electrodes do, it gets those with its own. The trial does not
+    count: trials of one resistor are of one driver.
+
+    Raises:
+        RecordingError: None of several calibrations has its labels.
+    """
+    paths: list[str] = []
+    for name in of.calibration:
+        under = [one for path, one in known.items() if f"{path}/".startswith(f"{name}/")]
+        differing = [
+            label
+            for label in LABELS
+            if label != "trial" and len({getattr(one, label) for one in under}) > 1
+        ]
+        own = {label: getattr(of, label) for label in differing}
+        found = [one.path for one in under if own == {n: getattr(one, n) for n in differing}]
+        if under and not found:
+            raise RecordingError(
+                f"none of the {len(under)} calibrations in {name!r} has its "
+                + ", ".join(f"{label} {value!r}" for label, value in own.items()),
+                path=of.path,
+                field="calibration",
+                remedy="Add the one that is missing, or name one for all in a mapping",
+            )
+        paths += found or [name]
+    return tuple(paths)
 
 
 def _layout(name: str, channel: Channel, factor: float) -> Layout:

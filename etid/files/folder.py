@@ -46,7 +46,7 @@ class ImportedFolder:
         mapping: The mapping that imports the same files again.
     """
 
-    imported: Mapping[str, Imported]
+    imported: Mapping[str, Sequence[Imported]]
     labels: Mapping[str, Mapping[str, Any]]
     unmatched: Sequence[str]
     mapping: pathlib.Path
@@ -58,10 +58,12 @@ class ImportedFolder:
             of = self.imported[file]
             said = [f"{n} {labels[n]}" for n in labels if n != "r_load"]
             said += [f"{labels[n] / 1e3:g} kΩ" for n in labels if n == "r_load"]
-            where = of.paths[0] + (f" … {of.paths[-1]}" if len(of.paths) > 1 else "")
-            lines.append(f"{file} → {where}: {', '.join(said)}; {of.samples} samples")
-            lines += of.notes
-            for line in of.channels:
+            paths = [path for one in of for path in one.paths]
+            where = paths[0] + (f" … {paths[-1]}" if len(paths) > 1 else "")
+            samples = " or ".join(dict.fromkeys(str(one.samples) for one in of))
+            lines.append(f"{file} → {where}: {', '.join(said)}; {samples} samples")
+            lines += dict.fromkeys(note for one in of for note in one.notes)
+            for line in dict.fromkeys(line for one in of for line in one.channels):
                 files_of.setdefault(line, []).append(file)
         channels = [  # files differ where only some name a unit
             line if len(files) == len(self.labels) else f"{line}: {listed(files)}"
@@ -86,8 +88,9 @@ def import_folder(
     """Convert the files of a folder into one etid file, with labels from their names.
 
     A recording names the calibrations whose labels do not contradict its own as its calibrations:
-    with `{session}` in both patterns, those of its session. Beside the target, the mapping
-    `TARGET.toml` is written: `import_file(FOLDER, target, mapping)` imports the same files again.
+    with `{session}` in both patterns, those of its session; and of several electrodes in one file,
+    that of its own. Beside the target, the mapping `TARGET.toml` is written: `import_file(FOLDER,
+    target, mapping)` imports the same files again.
 
     Args:
         folder: Folder of the files; files of folders in it match patterns with a `/`.
@@ -118,7 +121,7 @@ def import_folder(
     said = {root / file: {**common, **of} for file, of in tables.items()}
     imported = converted(said, target)
     mapping = pathlib.Path(os.fspath(target)).with_suffix(".toml")
-    files = dict(zip(tables, imported, strict=True))
+    files = {file: [one for one in imported if one.file == str(root / file)] for file in tables}
     _say_units(common, tables, files)
     content = {**common, "recording": [{"file": file, **of} for file, of in tables.items()]}
     with replacing(mapping) as partial:
@@ -127,7 +130,9 @@ def import_folder(
 
 
 def _say_units(
-    common: dict[str, Any], tables: Mapping[str, dict[str, Any]], files: Mapping[str, Imported]
+    common: dict[str, Any],
+    tables: Mapping[str, dict[str, Any]],
+    files: Mapping[str, Sequence[Imported]],
 ) -> None:
     """Add the units that the command implied, because a mapping implies none.
 
@@ -135,9 +140,10 @@ def _say_units(
     """
     for name in [name for name in CHANNELS if name in common]:
         implied = {
-            file: {**common[name], "unit": of.signals[name].unit}
+            file: {**common[name], "unit": one.signals[name].unit}
             for file, of in files.items()
-            if of.signals[name].unit_by == "command"
+            for one in of
+            if one.signals[name].unit_by == "command"
         }
         if len(implied) == len(files):
             common[name] = next(iter(implied.values()))

@@ -28,7 +28,7 @@ from etid.files.mapping import (
 )
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
 from etid.recordings.errors import optional, require_file
-from etid.recordings.fields import LABELS
+from etid.recordings.fields import LABELS, Metadata
 from etid.recordings.recording import AbstractSource, RecordingError, check_rates
 from etid.recordings.study import Study, refuse_nested
 
@@ -75,6 +75,8 @@ def import_file(
 
     A channel may be a pattern, as in `v_out="CH{electrode}"`: each channel that matches becomes a
     recording with this label. So a file with a channel for each electrode of an array is imported.
+    Of a file of `calibrations` with several electrodes, a recording names that of its own; of one
+    electrode, all recordings name it.
 
     A mapping assigns channels to signals; data_schema/README.md lists its keys. For one recording,
     arguments with the same names can replace the mapping. With arguments, a channel without a unit
@@ -203,7 +205,7 @@ def converted(
         _check_suffix(path)
     sources: dict[str, AbstractSource] = {}
     used: list[Imported] = []
-    stacks: dict[str, list[str]] = {}  # recordings of each planned path
+    calibrations: dict[str, Metadata] = {}
     with contextlib.ExitStack() as files:
         for path, table in said.items():
             file = str(path)
@@ -211,8 +213,6 @@ def converted(
             told = {name: value for name, value in table.items() if name not in written}
             if path.suffix.lower() != ".csv":
                 _refuse(written, file, "is only for CSV tables")
-            if isinstance(names := told.get("calibration"), list):
-                told["calibration"] = [one for name in names for one in stacks.get(name, [name])]
             with located(file):
 
                 def opened(one: pathlib.Path, written: Mapping[str, Any] = written) -> Contents:
@@ -227,7 +227,7 @@ def converted(
                 contents.prepare({name for plan in planned for name in plan.channels})
                 for plan in planned:
                     with located(file, path=plan.path if len(planned) > 1 else ""):
-                        found, made_of = sources_of(plan, contents.channel, file, by)
+                        found, made_of = sources_of(plan, contents.channel, file, by, calibrations)
                     for each in found.values():
                         with located(file):
                             names = {record.name for record in each.layout}
@@ -240,7 +240,8 @@ def converted(
                             remedy="Rename the file, or give each recording a path in a mapping",
                         )
                     sources |= found
-                    stacks[plan.path] = list(found)
+                    if plan.fields.get("r_load") is not None:
+                        calibrations |= {path: one.metadata for path, one in found.items()}
                     used.append(made_of)
         with located(str(next(iter(said)))):
             refuse_nested(sources)

@@ -157,7 +157,7 @@ def plans(mapping: Mapping[str, Any], names: Sequence[str], name: str = "") -> l
     common = {key: value for key, value in mapping.items() if key != "recording"}
     check_names(common, (*CHANNELS, *FIELDS, "recording" if tables else "path"), _KEY)
     recordings = [
-        said for table in tables or [{}] for said in _of_channels({**common, **table}, names)
+        said for table in tables or [{}] for said in _of_channels({**common, **table}, names, name)
     ]
     planned: list[Plan] = []
     for said in recordings:
@@ -167,7 +167,7 @@ def plans(mapping: Mapping[str, Any], names: Sequence[str], name: str = "") -> l
             raise RecordingError(
                 "is not given", field="path", remedy="Give each [[recording]] a path of its own"
             )
-        path = path or tidy_path(f"{KINDS[said.get('r_load') is not None]}/{name}")
+        path = path or _default_path(said, name)
         if any(plan.path == path for plan in planned):
             raise RecordingError("two recordings have this path", path=path)
         with located(path=path if len(recordings) > 1 else ""):
@@ -175,16 +175,23 @@ def plans(mapping: Mapping[str, Any], names: Sequence[str], name: str = "") -> l
     return planned
 
 
-def _of_channels(said: Mapping[str, Any], names: Sequence[str]) -> list[Mapping[str, Any]]:
+def _default_path(said: Mapping[str, Any], name: str) -> str:
+    """HDF5 path of a recording without a path, from the name of its file if there are several."""
+    return tidy_path(f"{KINDS[said.get('r_load') is not None]}/{name}")
+
+
+def _of_channels(
+    said: Mapping[str, Any], names: Sequence[str], name: str
+) -> list[Mapping[str, Any]]:
     """A recording for each channel that a pattern such as `CH{electrode}` matches.
 
     Without a pattern there is one recording. Other patterns have the labels of that of `v_out`.
     """
     patterns = {
-        name: said[name]["channel"]
-        for name in CHANNELS
-        if isinstance(said.get(name), Mapping)
-        and any(f"{{{label}}}" in str(said[name].get("channel")) for label in LABELS)
+        signal: said[signal]["channel"]
+        for signal in CHANNELS
+        if isinstance(said.get(signal), Mapping)
+        and any(f"{{{label}}}" in str(said[signal].get("channel")) for label in LABELS)
     }
     if "v_out" not in patterns:
         return [said]
@@ -195,14 +202,14 @@ def _of_channels(said: Mapping[str, Any], names: Sequence[str]) -> list[Mapping[
             f"no channel matches {patterns['v_out']!r}; the channels are {listed(names)}",
             field="v_out",
         )
-    base = tidy_path(said.get("path", "")) or KINDS[0]
+    base = tidy_path(said.get("path", "")) or _default_path(said, name)
     return [
         {
             **said,
             **labels,
             **{
-                name: {**said[name], "channel": text.format(**labels)}
-                for name, text in patterns.items()
+                signal: {**said[signal], "channel": text.format(**labels)}
+                for signal, text in patterns.items()
             },
             "path": "/".join([base, *labels.values()]),
         }
