@@ -483,7 +483,7 @@ class Batch:
         def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
             def fitted_with(known: Any) -> Fit:
                 of = driver, known, circuit, estimator
-                if not worth_compiling(total * lanes[0].size):
+                if not worth_compiling(total, lanes[0].periodic):
                     return stacked(jax.device_get([skin(lane, *of) for lane in lanes]))
                 fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
                 return taken(fits, np.arange(len(lanes)))  # without the padding

@@ -237,7 +237,7 @@ class _Group:
         self.repeats += repeats(batch.seen)
 
     def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
-        fit = _ALONE[worth_compiling(self.total * lanes[0].size)]
+        fit = _ALONE[worth_compiling(self.total)]
         several = filled(lanes), jax.device_put(len(lanes))
         found = jax.device_get(fit(*several, self.model, self.driver))
         return unstacked(found)[: len(lanes)]
@@ -406,7 +406,7 @@ def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit]
     driver, loads = groups[0].driver, [group.loads() for group in groups]
     several = tuple(len(group.several()) for group in groups)
     model = _model(options, driver, any(group.shared for group in groups))
-    together = _TOGETHER[worth_compiling(sum(of.spectrum.x.size for of in loads))]
+    together = _TOGETHER[worth_compiling(sum(of.used.size for of in loads))]
     found, better, delays, cov = together(model, loads, several, driver)
     found, delays, cov = jax.device_get((found, delays, cov))
     small = [np.zeros(len(group.rows), bool) for group in groups]

@@ -41,9 +41,10 @@ AT_ONCE = {
     "xla_cpu_prefer_vector_width": 128,
 }
 
-# XLA compiles a batch for some 5 s. NumPy takes 5 to 10 ms longer for each skin of 1728 harmonics,
-# and longer in proportion for samples: from about 400 such skins on, XLA is sooner.
-WORTH_COMPILING = 400 * 1728
+# XLA compiles a batch for 3 to 8 s, the longer the records are. NumPy takes 7 to 35 ms longer than
+# XLA for each fit of harmonics, however many there are, and ten times as long for a fit in time.
+WORTH_COMPILING = 400  # fits of harmonics
+WORTH_COMPILING_IN_TIME = 40  # fits of samples
 
 PATIENCE = 1.0  # [s] waiting time without a word
 COMPILING = "etid: JAX compiles the fit, once in each process."
@@ -137,9 +138,10 @@ def _is_known(name: str, value: bool | int | str) -> bool:
     return True
 
 
-def worth_compiling(numbers: int) -> bool:
-    """Whether fits of arrays with so many numbers in all are sooner done if they are compiled."""
-    return numbers >= WORTH_COMPILING or not _by_numpy()
+def worth_compiling(fits: int, harmonics: bool = True) -> bool:
+    """Whether so many fits, of harmonics or in time, are sooner done if they are compiled."""
+    enough = WORTH_COMPILING if harmonics else WORTH_COMPILING_IN_TIME
+    return fits >= enough or not _by_numpy()
 
 
 def _by_numpy() -> bool:
