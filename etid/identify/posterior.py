@@ -140,7 +140,7 @@ class Impedances(NamedTuple):
     @classmethod
     def of_circuit(cls, circuit: AbstractCircuit, least: Float[np.ndarray, " q"]) -> "Impedances":
         """Those of the elements of a circuit, at the minimum of F."""
-        powers = np.asarray(circuit.scaling()[0])
+        powers = np.asarray(_powers(circuit))
         return cls(least, np.pad(powers, (0, least.size - powers.size)))
 
     def of(self, q: Float[np.ndarray, " q"]) -> Float[np.ndarray, " q"]:
@@ -160,6 +160,11 @@ class Impedances(NamedTuple):
         x = self.of(mean)
         slopes = np.where(self.powers != 0, self.powers * x, 1.0)
         return x, cov * np.outer(slopes, slopes)
+
+
+@program
+def _powers(circuit: AbstractCircuit) -> Float[Array, " element"]:
+    return circuit.scaling()[0]
 
 
 def stretched(
