@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import etid
+from benchmarks.ladder import LOADS
 from etid.identify.posterior import inside, stretched
 from etid.results.posterior import Profile
 from etid.solvers.importance_sampling import drawn, effective
@@ -99,7 +100,7 @@ def test_at_20_db_intervals_contain_the_truth_of_posterior_and_profile(kind):
     """Where R_s + R_p is known and R_s is not, a search in their logarithms finds two thirds."""
     scene = {"dry": etid.scenes.paper_dry, "damp": etid.scenes.paper_damp}[kind](snr_db=20.0)
     scene = dataclasses.replace(scene, trials=scene.trials[:1])
-    load, covered = scene.trials[0].load, []
+    load, covered = LOADS[kind], []
     truth = np.array([load.r_s, load.r_p, load.c_p, load.r_s])  # the profile is of R_s
     for seed in range(100, 140):
         study = scene.simulate(seed=seed)
