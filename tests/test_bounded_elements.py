@@ -83,6 +83,15 @@ def test_several_bounded_elements_are_those_of_draws_inside_the_box():
     assert bool(far.contradicted)
 
 
+def test_the_deviance_of_several_bounds_is_that_of_the_nearest_point_between_them():
+    """A bound far away leaves its element free to follow: two standard errors of R_s cost 4."""
+    circuit, deviation = etid.SkinRC(30e3, 180e3, 0.1e-9), np.array([3e3, 3e3, 3e-12])
+    related = np.array([[1, -0.9, 0], [-0.9, 1, 0], [0, 0, 1]])
+    cov = jnp.asarray(related * np.outer(deviation, deviation))
+    found = within(circuit, cov, cov, (("r_s", 36e3, np.inf), ("r_p", 90e3, 270e3)))
+    np.testing.assert_allclose(found.deviance, 4.0, rtol=1e-6)
+
+
 TRUTH, ERROR = np.array([30e3, 180e3, 0.1e-9]), np.array([3e3, 3e3, 3e-12])
 RELATED = np.array([[1, -0.8, 0.5], [-0.8, 1, -0.4], [0.5, -0.4, 1]])
 

@@ -92,6 +92,20 @@ def assert_falls(name, size, stderr):
     assert (np.abs(size - expected) < 4 * stderr + 0.005).all()
 
 
+def test_a_gain_behind_a_current_is_right_at_all_frequencies_if_periods_begin_between_samples():
+    """A resistor of another size in each period; the cuts are up to a third of a sample late."""
+    size, place = np.array([0.0, -0.02, 0.05]), np.arange(10_000)
+    pulses = np.exp(-0.5 * ((place % (10_000 / 3) - 5_000 / 3) / 1.5) ** 2)
+    noise = 1e-5 * np.random.default_rng(0).standard_normal((2, place.size))
+    load = 5e3 * (1 + size[(place / (10_000 / 3)).astype(int)])
+    current, v_out = 1e-3 * (pulses + noise[0]), load * 1e-3 * (pulses + noise[1])
+    one = etid.Recording(v_out=v_out, current=current, sample_rate=200e3, pulse_rate=60.0)
+    of = repeats_of(one)
+    far = (of.frequency > 5e3) & (of.frequency < 50e3)  # from the lines of a drift and the noise
+    expected = np.broadcast_to((size - size.mean())[:, None], of.gain[:, far].shape)
+    np.testing.assert_allclose(of.gain[:, far], expected, atol=1.5e-3)  # of first order in `size`
+
+
 @pytest.mark.parametrize(
     ("share", "seed", "settings", "allowed", "seen"),
     [

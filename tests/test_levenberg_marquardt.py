@@ -6,6 +6,7 @@ import optimistix as optx
 import pytest
 import scipy.optimize
 
+from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import (
     LevenbergMarquardt,
 )
@@ -169,13 +170,22 @@ def test_lanes_do_not_see_each_other(lanes):
     np.testing.assert_array_equal(run(data[order]), values[order])
 
 
-def test_the_solution_differentiates_with_respect_to_the_data():
+def by_optimistix(*problem):
+    return optx.least_squares(*problem, max_steps=100, throw=False)
+
+
+def by_etid(*problem):
+    return least_squares(*problem, max_steps=100)
+
+
+@pytest.mark.parametrize("found", [by_optimistix, by_etid])
+def test_the_solution_differentiates_with_respect_to_the_data(found):
     """By the implicit function theorem; the parameters react to each sample as differences say."""
 
     @jax.jit
     def rate(data):
         solver = LevenbergMarquardt(rtol=1e-8, ftol=0.0)
-        return optx.least_squares(decay, solver, START, data, max_steps=100, throw=False).value[1]
+        return found(decay, solver, START, data).value[1]
 
     gradient = jax.jit(jax.grad(rate))(jnp.asarray(DATA))
     direction = np.random.default_rng(3).normal(size=TIME.size)

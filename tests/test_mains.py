@@ -98,6 +98,22 @@ def test_a_record_that_is_not_finite_has_no_hum(value):
     assert mains.separated(v, 0.01, 200e3, 3, 10_000) is None
 
 
+def test_every_record_too_long_for_a_quick_look_is_examined_for_hum():
+    v = np.zeros((1, quick_looks.PROBED + 1))
+    assert quick_looks.humming(v, np.array([1e-6]), 200e3, 60.0, 60, v.size).all()
+
+
+@pytest.mark.parametrize("volts", [0.0, 0.002])
+def test_hum_is_not_hidden_by_what_pulses_of_broken_periods_leak(volts):
+    """Three periods are 10 000.4 samples: pulses of 1 V leak less than 2 mV of hum does."""
+    place = np.arange(10_001.0)
+    pulses = np.exp(-(((place / 10_000.4 * 3 % 1 - 0.4) / 0.05) ** 2))
+    v = pulses + volts * np.sin(2 * np.pi * 50 / 200e3 * place)
+    rate = 3 * 200e3 / 10_000.4
+    found = quick_looks.humming(v[None], np.array([1e-3]), 200e3, rate, 3, 10_000)
+    assert found.all() == (volts > 0)
+
+
 @pytest.mark.parametrize("frequency", [50.0, 60.0, 59.97])
 def test_elements_are_those_without_hum(records, quiet, frequency):
     calibration, skin = (hummed(one, frequency, 0.1, seed) for seed, one in enumerate(records))

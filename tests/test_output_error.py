@@ -13,6 +13,7 @@ from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.circuits.elements import resistor
 from etid.estimators.estimate import DELAY_WIDTH, KNOWN_DELAY, SOLVER, delay_std
 from etid.estimators.lanes import PaddedSamples
+from etid.estimators.output_error.estimator import _has_aliases
 from etid.estimators.output_error.fit import fit_source
 from etid.estimators.output_error.information import (
     Slopes,
@@ -22,6 +23,7 @@ from etid.estimators.output_error.prediction import (
     IMPULSE,
     impulse,
     late_calibration,
+    loaded_filter,
     measured_impulse,
     prepare,
 )
@@ -29,6 +31,7 @@ from etid.estimators.registry import OUTPUT_ERROR
 from etid.identify.fitting import skin
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, SourceImpedance
+from etid.signals.filtering import simulate
 from etid.signals.noise import Measurement
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -79,6 +82,38 @@ def test_a_late_calibration_is_an_excess_impedance_and_a_delay(z_load):
     # A sine's root cannot be trusted where it is flat; it is interpolated to a thousandth.
     steep = np.abs(v_th) < 0.9
     np.testing.assert_allclose(np.asarray(late.v_out)[steep], expected[steep], rtol=0.02)
+
+
+def test_a_late_calibration_is_the_same_where_a_record_begins_in_a_pulse():
+    """As in a record of the whole pulse, but for what the free state at the start can do."""
+    records = prepared(measurement(jnp.exp(-(((jnp.arange(400.0) - 250) / 60) ** 2))))
+    whole, end = (  # of equal length, so that one compilation serves both
+        jax.tree.map(lambda leaf, part=part: leaf[part] if leaf.ndim else leaf, records)
+        for part in (slice(250), slice(100, 350))
+    )
+    source, load = plain(15e3), etid.SkinRC(30e3, 180e3, 1e-9).impedance().rational()
+    system, run = loaded_filter(source, load, records.sample_rate), eqx.filter_jit(simulate)
+    rest, late = jnp.zeros(system.C.size), eqx.filter_jit(late_calibration)
+    x0 = run(system, records.hold[:100], rest)[1]
+    expected = late(whole, source, load, jnp.asarray(98.8e3), rest).v_out[100:]
+    off = late(end, source, load, jnp.asarray(98.8e3), x0).v_out[:150] - expected
+    decays = [run(system, 0 * end.hold, state)[0][:150] for state in jnp.eye(rest.size)]
+    free = np.stack(decays, axis=1)
+    left = off - free @ np.linalg.lstsq(free, off)[0]
+    np.testing.assert_allclose(left, 0.0, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_a_step_has_aliases_in_any_unit_and_what_a_filter_leaves_has_none(unit):
+    rng, place = np.random.default_rng(0), np.arange(3000)
+    steps = np.where((place > 1000) & (place < 1200), 1.0, 0.0)
+    passed = np.exp(-((np.fft.rfftfreq(place.size) / 0.15) ** 2))
+    smooth = np.fft.irfft(np.fft.rfft(steps) * passed, place.size)
+    for waveform, expected in ((steps, True), (smooth, False), (0 * steps, False)):
+        v = jnp.asarray(unit * (waveform + 1e-3 * rng.standard_normal(place.size)))
+        sigma = jnp.asarray(1e-3 * unit)
+        m = Measurement(v, v, sigma, sigma, jnp.asarray(RATE))
+        assert bool(_has_aliases(m, jnp.asarray(place.size))) == expected
 
 
 def test_the_noise_of_a_record_is_no_information():

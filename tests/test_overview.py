@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.circuits.display import quantity
+from etid.circuits.display import between, quantity
 from etid.circuits.overview import ROWS, Overview
 from etid.recordings.remarks import Remark
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
@@ -145,6 +145,11 @@ def test_numbers_have_units_and_no_array_is_printed(make, texts):
     assert str(one) == one._overview().text()
 
 
+def test_several_circuits_say_how_many_and_one_does_not():
+    assert str(fits().circuit).startswith("SkinRC, batch of (3,)")
+    assert "batch" not in str(DRY)
+
+
 def test_tables_of_fits_are_those_of_before():
     many, numbers = fits(), {}
     size = np.array([1.0, 1.02, 1.1, 0.99, 1.3])
@@ -227,6 +232,18 @@ def test_what_jax_traces_or_maps_can_be_shown(make):
 )
 def test_the_prefix_of_a_unit_fits_the_value(value, error, unit, text):
     assert quantity(value, unit, error) == text
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "text"),
+    [
+        (33.29e3, 33.61e3, "33.290 … 33.610 kΩ"),  # a quarter is 0.080 kΩ
+        (33e3, 34.2e3, "33.00 … 34.20 kΩ"),
+        (5.5, 5.5, "5.5 … 5.5 Ω"),
+    ],
+)
+def test_the_digits_of_an_interval_are_those_of_a_quarter_of_its_length(low, high, text):
+    assert between(low, high, "ohm") == text
 
 
 def test_an_estimate_that_diverges_predicts_nothing():

@@ -62,6 +62,20 @@ def test_noise_of_any_size_is_seen_through_the_steps():
         assert not noise.is_coarse(v, step)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_noise_through_the_steps_has_the_unit_of_the_record(unit):
+    v = np.round(2.0 * np.random.default_rng(1).standard_normal(20_000))
+    expected = unit * noise.noise_before(v, 1.0)
+    np.testing.assert_allclose(noise.noise_before(unit * v, unit), expected, rtol=1e-9)
+
+
+def test_the_waveform_before_rounding_keeps_a_jump_and_the_last_sample():
+    """Straight lines through the change of one code, at 5.5; the record shows the rest itself."""
+    v = np.array([0.0, 0.0, 0.0, 10.0, 10.0, 10.0, 11.0])
+    expected = [0.0, 0.0, 0.0, 10.0, 10.2, 10.4, 11.0]
+    np.testing.assert_allclose(noise._before(v, 1.0, 0.5), expected)
+
+
 @pytest.mark.parametrize("codes", [True, False])
 def test_a_converter_whose_noise_is_a_step_is_weighed_by_its_noise(codes):
     """12 bits of ±10 V at 40 dB: the noise is as large as a step, and was overlooked."""

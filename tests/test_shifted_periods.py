@@ -61,6 +61,7 @@ def test_a_period_whose_pulse_has_the_fault_is_left_out(records, load, fault):
         seen = Inspected(one)
         assert seen.shifts is not None
         np.testing.assert_array_equal(np.flatnonzero(seen.shifts.bad), [period])
+        assert np.median(np.delete(seen.shifts.late, period)) == 0  # most periods stay in place
         assert seen.periods[0] == 5
         assert seen.remarks & Remark.periods_left_out
         assert f"pulse of period {period + 1}" in how_shifted(seen)
