@@ -1,6 +1,7 @@
 """Batches: chunks, lengths, rates and drivers mixed; every recording gets its own answer."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import h5py
@@ -10,6 +11,7 @@ import pytest
 
 import etid
 from etid.identify import fitting
+from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 from tests.skins import DRY, off
@@ -119,6 +121,27 @@ def test_a_failed_driver_costs_its_own_recordings():
     assert good == ""
     assert "'calibration/1': flat" in flat
     assert all(name in note for name, note in zip(named[2:], none, strict=True))
+
+
+def test_a_study_shows_its_progress_only_on_request(capsys):
+    study = simulate(samples=LENGTH // 2)
+    records = [one.replace(v_out=np.zeros(LENGTH // 2)) for one in study.recordings()]
+    asked: tuple[tuple[dict[str, Any], str], ...] = (({}, ""), ({"progress": True}, "1/1"))
+    for options, shown in asked:
+        etid.identify_study(etid.Study.from_recordings(records), **options)
+        assert shown in (printed := capsys.readouterr().err)
+        assert options or printed == ""
+
+
+def test_long_recordings_are_fitted_in_calls_of_fewer_lanes(study, monkeypatch):
+    monkeypatch.setattr(fitting, "LANES", 2 * MANY)
+    monkeypatch.setattr(fitting, "HELD", MANY * LENGTH)
+    nothing: Any = None
+    batch = fitting.Batch(fitting.Prepared(*[nothing] * len(fitting.Prepared._fields)))
+    for row, recording in enumerate(study.loaded.recordings()):
+        assert not batch.full
+        batch.add(row, batch.like._replace(seen=Inspected(recording)))
+    assert batch.full
 
 
 def test_a_driver_without_success_is_kept_and_marks_its_fits(study):

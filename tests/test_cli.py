@@ -435,3 +435,10 @@ def test_completion_is_offered_for_every_shell_there_is_one_for(run):
         status, printed, complaints = run("--completion", shell)
         assert (status, complaints) == (DONE, [])
         assert any("snr-db" in line for line in printed)
+
+
+def test_completion_without_its_package_names_what_to_install(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    status, printed, complaints = run("--completion", "bash")
+    assert (status, printed) == (WRONG_USAGE, [])
+    assert "--completion needs shtab: pip install 'etid[completion]'" in complaints[-1]

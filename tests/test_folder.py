@@ -71,6 +71,14 @@ def test_the_command_replaces_no_mapping_unasked(folder, tmp_path, capsys):
     assert "left out, matches no pattern: notes.txt" in capsys.readouterr().out
 
 
+def test_the_command_imports_a_folder_by_the_mapping_that_another_has_left(folder, tmp_path):
+    found = import_folder(folder, tmp_path / "study.h5", PATTERNS, **OPTIONS)
+    assert found.mapping == tmp_path / "study.toml"
+    words = ["import", str(folder), "-o", str(tmp_path / "again.h5")]
+    assert main([*words, "--mapping", str(found.mapping)]) == 0
+    assert (tmp_path / "study.h5").read_bytes() == (tmp_path / "again.h5").read_bytes()
+
+
 def test_a_table_names_resistors_of_files_whose_names_do_not(folder):
     (folder / "calibrations.csv").write_text("file, ohm\nd1_cal_98k8.csv, 21k62\n", "utf-8")
     found, unmatched = labelled(folder, ["{subject}_{session}_{trial}.csv"])
@@ -105,6 +113,12 @@ def test_a_name_that_could_be_read_in_two_ways_does_not_match():
         "s01__3.csv",
     ):
         assert expression.fullmatch(name) is None, name
+
+
+def test_a_label_may_contain_the_letters_of_the_text_before_it():
+    match = pattern("day-{subject}_{trial}.csv").fullmatch("day-anna_3.csv")
+    assert match is not None
+    assert match.groupdict() == {"subject": "anna", "trial": "3"}
 
 
 def test_resistances_are_written_as_in_electronics():

@@ -1,6 +1,7 @@
 """The live view: what a browser shows of a running display, its stop, and what is refused."""
 
 import contextlib
+import dataclasses
 import http.client
 import json
 import os
@@ -14,6 +15,7 @@ import threading
 import time
 import urllib.request
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from chromium import chromium
@@ -28,7 +30,18 @@ from etid.online.state import Change
 from etid.online.stream import connected, received, sender
 from etid.plotting.layout import Layout
 from etid.simulation.transformer import ResistorLoad, Sampler, loading
-from tests.test_online import LOADS, NOISE, PERIOD, PULSES, RATE, TEN, scene, tracker_of
+from tests.test_online import (
+    DRY,
+    LOADS,
+    NOISE,
+    PERIOD,
+    PULSES,
+    RATE,
+    TEN,
+    quiet,
+    scene,
+    tracker_of,
+)
 
 DISPLAY = 98
 WANTED = 80e-9
@@ -120,8 +133,13 @@ def asked(view, method, path, body="", **headers):
         return answer.status, answer.read().decode()
 
 
+def told(view):
+    """What the page knows before the first snapshot."""
+    return json.loads(re.findall(r"told = (.*);\n", asked(view, "GET", "/")[1])[0])
+
+
 def token_of(view):
-    return json.loads(re.findall(r"told = (.*);\n", asked(view, "GET", "/")[1])[0])["token"]
+    return told(view)["token"]
 
 
 def shown(view):
@@ -260,6 +278,28 @@ def test_the_loop_waits_for_no_page_and_no_memory_grows(monkeypatch):
         assert passed.max() < 1.0
         maps = pathlib.Path(f"/proc/{view._process.pid}/maps").read_text()
         assert "jaxlib" not in maps, "the page's process takes no memory and cores of JAX"
+
+
+def test_the_page_draws_the_pulse_without_the_rest_of_its_period(view):
+    times = 1e-6 * np.array(told(view)["time"])
+    v_th = np.abs(quiet()["dry"].v_th[: int(PERIOD)])
+    (high,) = np.nonzero(v_th > v_th.max() / 2)
+    assert times[0] <= high[0] / RATE <= high[-1] / RATE <= times[-1] < 0.1 / PULSES
+
+
+def test_the_page_predicts_a_pulse_by_the_circuit_of_its_skin(view):
+    tick = tick_of(tracker_of(TEN, 3e-3))
+    own = jnp.tile(jnp.array([*np.log(dataclasses.astuple(DRY)), 0.0]), (TEN, 1))  # without a delay
+    known = dataclasses.replace(
+        tick.state.electrodes, own=own, pulses=jnp.ones(TEN, int), amplitude=jnp.ones(TEN)
+    )
+    state = dataclasses.replace(tick.state, electrodes=known)
+    predicted = view._predicted(tick._replace(before=state, state=state), 0)
+    bands = view._controller.tracker.model.bands
+    f = np.fft.rfftfreq(bands.samples, 1 / RATE)[1:]
+    gain = np.append(0, loading(DRY(f), scene(1).driver.z_th(f)))
+    true = np.fft.irfft(gain * np.fft.rfft(bands.waveform()), bands.samples)[view._part]
+    assert np.std(predicted - true) < 1e-3 * np.ptp(true)
 
 
 def test_a_slow_tick_is_not_shown():

@@ -5,6 +5,7 @@ import pathlib
 import socket
 import sys
 import threading
+import time
 
 import h5py
 import numpy as np
@@ -86,15 +87,20 @@ def test_a_file_is_played_to_its_end_and_logged(example, tmp_path, capsys):
         file["v_out"] = v_out
     arguments = [str(tmp_path / "calibration.h5"), str(tmp_path / "pulses.h5")]
     arguments += ["--electrodes", "2", "--speed", "1000", "--log", str(tmp_path / "log.h5")]
+    begin = time.perf_counter()
     example.main(arguments)
+    passed = time.perf_counter() - begin
     said = capsys.readouterr().out
     assert said == "20 pulses, 0 incomplete, 0 late blocks\n"
     with h5py.File(tmp_path / "log.h5") as log:
-        r_p, verdict, pulse = (np.asarray(log[name]) for name in ("r_p", "verdict", "pulse"))
+        names = "r_p", "verdict", "pulse", "seconds"
+        r_p, verdict, pulse, seconds = (np.asarray(log[name]) for name in names)
     assert r_p.shape == (20, 2)
     np.testing.assert_allclose(r_p[-1, 0], DRY.r_p, rtol=0.01)  # ten standard errors
     np.testing.assert_array_equal(pulse, range(20))
     assert (verdict == 0).all()
+    assert (seconds > 0).all()
+    assert seconds.sum() < passed
     with pytest.raises(ValueError, match=r"log\.h5 exists"):  # no run loses the log of another
         example.main(arguments)
 

@@ -384,6 +384,13 @@ def test_electrodes_with_a_place_have_a_map_of_each_element_above_their_folded_t
     assert page.index("Maps of c_p") < page.index("<summary>Table of 2 rows</summary>")
 
 
+def test_the_table_of_few_subjects_is_not_folded(page):
+    _, subjects = page.read_text("utf-8").split(">Subjects</h2>")
+    table, _ = subjects.split("</section>", 1)
+    assert "<table" in table
+    assert "<details" not in table
+
+
 def test_no_success_at_all_and_no_fit_at_all(tmp_path):
     etid.write_report(fits_of([np.nan] * 2, ["flat"] * 2), tmp_path / "page.html")
     assert "No fit is successful" in _Read(tmp_path / "page.html").text
@@ -473,6 +480,15 @@ def test_methods_of_fits_from_a_current_tell_of_no_driver(found, method):
         assert words not in section.text + section.details
     assert "scales of current and voltage" in section.details
     assert "steiglitz1965" not in section.code
+
+
+def test_methods_count_the_recordings(found):
+    one = dataclasses.replace(found, fits=found.fits.take(np.array([0])))
+    for of, words in (
+        (one, "The recording of study.h5 was"),
+        (found, "The 6 recordings of study.h5 were"),
+    ):
+        assert f"{words} identified with etid" in methods.methods_section(of).details
 
 
 def test_methods_count_the_calibrations(found):

@@ -40,7 +40,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     decimal = _first(said, "Decimal_Separator", ".")
     if separator is None or decimal not in (".", ","):
         raise RecordingError("its header names no separator that etid knows", field="Separator")
-    dialect = Dialect(separator, decimal, ends[1] + 2, "utf-8-sig")
+    dialect = Dialect(separator, decimal)
     own = {
         key: rest for key, *rest in (line.split(separator) for line in lines[ends[0] + 1 : ends[1]])
     }
