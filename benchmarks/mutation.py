@@ -165,8 +165,11 @@ def judges(
     executed: Mapping[str, tuple[float, Mapping[str, Sequence[int]]]],
     calls: set[int],
 ) -> list[str]:
-    """Files of tests that execute a mutant, the fastest first; `calls` are lines that calls run."""
-    lines = {mutant.line} if mutant.inside else calls
+    """Files of tests that execute a mutant, the fastest first; `calls` are lines that calls run.
+
+    A module without functions has no calls: importing it executes its mutants.
+    """
+    lines = {mutant.line} if mutant.inside or not calls else calls
     of = {
         test: seconds
         for test, (seconds, by) in executed.items()

@@ -164,11 +164,11 @@ def test_a_fit_to_an_impedance_is_drawn_with_its_points():
     z = np.asarray(DRY.response(frequency))
     fit = pickle.loads(pickle.dumps(etid.identify_impedance(frequency, z)))
     for show in ("pulse", "impedance"):  # the first is the default
-        nyquist, magnitude, _ = fit.plot(show=show, axes=Figure().subplots(1, 3))
+        nyquist, *_ = fit.plot(show=show, axes=Figure().subplots(1, 3))
         points = nyquist.containers[0].lines[0]
         np.testing.assert_allclose(
             points.get_xydata(), np.stack([np.real(z), -np.imag(z)], 1) / 1e3
         )
-        labels = [text.get_text() for text in magnitude.get_legend().get_texts()]
+        labels = [text.get_text() for text in nyquist.get_legend().get_texts()]
         assert labels == ["fit", "measured"]  # no standard errors are known
     assert "chi2" not in str(fit)  # there is none

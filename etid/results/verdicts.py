@@ -73,10 +73,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "record. Check the channels, and the contact of the finger or of the resistor."
     )
     inconsistent = (
-        "Recording and calibrations contradict each other about the source impedance or the "
-        "unloaded voltage. The driver changed in between, r_load is wrong, or the load is another "
-        "circuit: try circuit='auto', or calibrate again. Beside a driver, check the scale of a "
-        "current too."
+        "Recording and calibrations contradict each other: the driver changed in between, r_load "
+        "is wrong, or the load is another circuit. Try circuit='auto', or calibrate again; beside "
+        "a driver, check the scale of a current too."
     )
     out_of_bounds = (
         "Recording and bounds contradict each other: without its bounds an element lies more than "
