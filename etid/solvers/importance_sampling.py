@@ -45,10 +45,10 @@ def drawn(
     weights = np.full(draws, np.nan)
     proposals = []
     while len(proposals) < ROUNDS:
-        proposals.append(scipy.stats.multivariate_t(mean, cov, FREEDOM))
-        drawn = proposals[-1].rvs(draws, random_state=random).reshape(draws, mean.size)
+        proposals.append((mean, np.linalg.cholesky(cov)))
+        drawn = _draws(*proposals[-1], draws, random)
         q, cost = np.concatenate([q, drawn]), np.concatenate([cost, costs(drawn)])
-        mixture = scipy.special.logsumexp([one.logpdf(q) for one in proposals], axis=0)
+        mixture = scipy.special.logsumexp([_log_density(q, *one) for one in proposals], axis=0)
         log_weight = np.where(np.isfinite(cost), -cost - mixture, -np.inf)
         weights = scipy.special.softmax(log_weight)
         if not effective(weights) < ENOUGH * draws:  # also if no draw has a weight
@@ -59,6 +59,27 @@ def drawn(
         if np.linalg.matrix_rank(cov) < mean.size:  # of fewer draws than parameters
             break
     return q, weights
+
+
+# scipy.stats.multivariate_t takes the covariance of a fixed element, 10⁻¹⁸, for a singular one.
+def _draws(
+    mean: Float[np.ndarray, " q"],
+    root: Float[np.ndarray, "q q"],
+    draws: int,
+    random: np.random.Generator,
+) -> Float[np.ndarray, "draw q"]:
+    """Draws from Student's t around a mean, with the Cholesky factor of its covariance."""
+    t = random.normal(size=(draws, mean.size))
+    return mean + t / np.sqrt(random.chisquare(FREEDOM, (draws, 1)) / FREEDOM) @ root.T
+
+
+def _log_density(
+    q: Float[np.ndarray, "draw q"], mean: Float[np.ndarray, " q"], root: Float[np.ndarray, "q q"]
+) -> Float[np.ndarray, " draw"]:
+    """Logarithm of its density, but for a constant."""
+    t = scipy.linalg.solve_triangular(root, (q - mean).T, lower=True)
+    volume = np.log(np.diagonal(root)).sum()
+    return -0.5 * (FREEDOM + mean.size) * np.log1p(np.sum(t**2, axis=0) / FREEDOM) - volume
 
 
 def _flattened(log_weight: Float[np.ndarray, " draw"], enough: float) -> Float[np.ndarray, " draw"]:
