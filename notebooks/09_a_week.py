@@ -20,7 +20,7 @@
 # turn. At the end you will know how a folder of oscilloscope files becomes maps of the skin, and
 # how much of what differs from day to day is skin and how much is error.
 #
-# It needs etid and Jupyter (`pip install . jupyterlab`), and takes two minutes.
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes a minute.
 
 # %%
 # %matplotlib inline
