@@ -237,9 +237,7 @@ def titled(axis: Axes, lines: Sequence[str], *, good: bool = True, beside: bool 
     panel, whole, dpi = axis.bbox, axis.figure.bbox, axis.figure.dpi
     room = panel.width if beside else min(whole.x1 - panel.x0, whole.width - MARGIN * dpi)
     text = wrapped("\n".join(filter(None, lines)), room / dpi, size := 9.0)
-    axis.set_title(
-        typeset(text), loc="left", fontsize=size, color=INK if good else RED, wrap=not beside
-    )
+    axis.set_title(typeset(text), loc="left", fontsize=size, color=INK if good else RED)
 
 
 def listed(fit: Fit) -> list[str]:
