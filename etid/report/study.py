@@ -14,6 +14,7 @@ import numpy as np
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several
 from etid.plotting.layout import FINGERTIP, Layout
+from etid.plotting.style import listed
 from etid.precision import in_float64
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.study import Study
@@ -111,7 +112,7 @@ def summary(found: StudyFits) -> str:
         path = str(fits.labels["path"][0])
         kind, method = type(fits.circuit).__name__, words(fits.fit.method)
         text = f"One recording, {path or 'without a path'}, "
-        if not np.isfinite(np.asarray(fits.circuit.values())).all():
+        if not listed(fits[0]):
             return f"{text}without success: {fits.verdicts[0]}."
         return f"{text}identified as {kind} by {method}."
     source = pathlib.Path(settings.source).name if settings is not None else ""
@@ -310,7 +311,7 @@ def _single(fits: Fits) -> Section:
     if chi2 := study_tables.significant(float(fits.chi2[0]), 3):
         text += f" χ² per degree of freedom is {chi2}; it is 1 if the residual is noise."
     tables = ()
-    if np.isfinite(np.asarray(fits.circuit.values())).all():
+    if listed(fits[0]):
         text += (
             " Own error: standard error from the noise of the recording. Shared error: standard "
             "error from the driver."
