@@ -42,23 +42,22 @@ def drawn(
         random: Source of the draws.
     """
     q, cost = np.zeros((0, mean.size)), np.zeros(0)
-    weights = np.full(draws, np.nan)
-    proposals = []
-    while len(proposals) < ROUNDS:
+    proposals: list[tuple[np.ndarray, np.ndarray]] = []
+    while True:
         proposals.append((mean, np.linalg.cholesky(cov)))
-        drawn = _draws(*proposals[-1], draws, random)
-        q, cost = np.concatenate([q, drawn]), np.concatenate([cost, costs(drawn)])
+        fresh = _draws(*proposals[-1], draws, random)
+        q, cost = np.concatenate([q, fresh]), np.concatenate([cost, costs(fresh)])
         mixture = scipy.special.logsumexp([_log_density(q, *one) for one in proposals], axis=0)
         log_weight = np.where(np.isfinite(cost), -cost - mixture, -np.inf)
         weights = scipy.special.softmax(log_weight)
-        if not effective(weights) < ENOUGH * draws:  # also if no draw has a weight
-            break
+        enough = not effective(weights) < ENOUGH * draws  # also if no draw has a weight
+        if enough or len(proposals) == ROUNDS:
+            return q, weights
         flat = _flattened(log_weight, min(SEVERAL * mean.size, ENOUGH * draws))
         mean = flat @ q
         cov = np.cov(q, rowvar=False, aweights=flat)
         if np.linalg.matrix_rank(cov) < mean.size:  # of fewer draws than parameters
-            break
-    return q, weights
+            return q, weights
 
 
 # scipy.stats.multivariate_t takes the covariance of a fixed element, 10⁻¹⁸, for a singular one.
