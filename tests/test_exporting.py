@@ -103,20 +103,26 @@ def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_pa
 
 
 @pytest.mark.parametrize("read", [pandas.read_csv, pandas.read_parquet])
-def test_a_long_table_has_a_row_for_each_element(fits, file, parts, tmp_path, read):
+def test_a_long_table_has_a_row_for_each_element(fits, parts, tmp_path, read):
+    change = np.random.default_rng(5).normal(size=(COUNT, 4))
+    changed = dataclasses.replace(fits.fit, change=change, change_stderr=np.ones_like(change))
+    fits = dataclasses.replace(fits, fit=changed)
+    fits.write(tmp_path / "fits.h5")
     target = tmp_path / f"long.{read.__name__.removeprefix('read_')}"
-    etid.export_fits(file, target, long=True)
-    options = {"keep_default_na": False, "na_values": ["nan"]} if read is pandas.read_csv else {}
+    options = {}
+    if read is pandas.read_csv:
+        options = {"keep_default_na": False, "na_values": ["nan"], "dtype": {"trial": str}}
+    etid.export_fits(tmp_path / "fits.h5", target, long=True, all=True)
     found = read(target, **options)
-    pandas.testing.assert_frame_equal(
-        found[["path", "element", "unit", "value", "stderr", "verdict"]],
-        fits.to_pandas(long=True)[["path", "element", "unit", "value", "stderr", "verdict"]],
-        check_dtype=False,
-    )
+    pandas.testing.assert_frame_equal(found, fits.to_pandas(long=True), check_dtype=False)
     assert len(found) == 3 * COUNT
-    wide = found.pivot(index="path", columns="element", values="value").loc[fits.labels["path"]]
-    np.testing.assert_array_equal(wide["c_p"], fits.circuit.c_p)
-    assert not {"r_s", "r_s_stderr", "r_s_change", "amplitude_change"} & set(found)
+    for column, expected in (("value", fits.circuit.c_p), ("change", change[:, 2])):
+        wide = found.pivot(index="path", columns="element", values=column).loc[fits.labels["path"]]
+        np.testing.assert_array_equal(wide["c_p"], expected)
+    assert not {"r_s", "r_s_stderr", "r_s_change"} & set(found)
+    etid.export_fits(tmp_path / "fits.h5", target, long=True)
+    left_out = {"change", "amplitude_change", "rrse", "chi2", "steps", "remarks"}
+    assert set(found) - set(read(target, **options)) == left_out
 
 
 def test_a_circuit_of_impedance_py_has_the_identified_values(fits, file, tmp_path):

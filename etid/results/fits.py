@@ -148,8 +148,8 @@ class Fits(Overviewed, Generic[Circuit]):
 
         Args:
             long: One row per element in place of one per fit, as mixed models and plots of groups
-                take it: the columns `element`, `unit`, `value` and `stderr` in place of those of
-                the elements and their changes.
+                take it: the columns `element`, `unit`, `value`, `stderr` and `change` in place of
+                those of the elements.
         """
         labels = {name: self.labels[name] for name in DESCRIBED}
         whole = labels | self.fit.table() | {"note": self.notes}

@@ -43,20 +43,26 @@ def described(recordings: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 
 
 def long_form(columns: Mapping[str, np.ndarray], units: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """A table of fits with one row per element: `element`, `unit`, `value` and `stderr`.
+    """A table of fits with one row per element: `element`, `unit`, `value`, `stderr`, `change`.
 
     Args:
-        columns: The columns of `Fits.table()`. Those that are not of an element stay.
+        columns: The columns of `Fits.table()`, with or without the changes of the elements. Those
+            that are not of an element stay.
         units: Units of the elements.
     """
-    own = {name + end for name in (*units, "amplitude") for end in ("", "_stderr", "_change")}
+    parts = {"value": "", "stderr": "_stderr", "change": "_change"}
+    own = {part: [name + end for name in units] for part, end in parts.items()}
+    rest = columns.keys() - {name for names in own.values() for name in names}
     count = len(columns["path"])
     return {
-        **{name: np.repeat(of, len(units)) for name, of in columns.items() if name not in own},
+        **{name: np.repeat(of, len(units)) for name, of in columns.items() if name in rest},
         "element": np.tile(list(units), count),
         "unit": np.tile(list(units.values()), count),
-        "value": np.stack([columns[name] for name in units], axis=1).ravel(),
-        "stderr": np.stack([columns[f"{name}_stderr"] for name in units], axis=1).ravel(),
+        **{
+            part: np.stack([columns[name] for name in names], axis=1).ravel()
+            for part, names in own.items()
+            if columns.keys() >= {*names}
+        },
     }
 
 
