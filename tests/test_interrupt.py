@@ -34,6 +34,22 @@ streaming.read = wait
 sys.exit(cli.main(["fit", sys.argv[1], "-o", sys.argv[2]]))
 """
 
+# As a terminal does, it interrupts its workers, too: they have just begun their imports.
+WORKERS = """
+import os, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from etid import cli
+from etid.identify import file as streaming
+
+def interrupt(futures):
+    time.sleep(0.3)
+    os.killpg(0, signal.SIGINT)
+    time.sleep(600)
+
+streaming.PART, streaming.concurrent.futures.as_completed = 6, interrupt
+sys.exit(cli.main(["fit", sys.argv[1], "-o", sys.argv[2], "--workers", "2"]))
+"""
+
 
 @pytest.fixture(scope="module")
 def interrupted(tmp_path_factory):
@@ -92,4 +108,17 @@ def test_ctrl_c_before_the_first_part_says_that_nothing_was_kept(interrupted):
     assert errors == [
         f"etid: interrupted: {folder}/first.h5 was not written, and nothing was kept: run the same "
         "command again"
+    ]
+
+
+def test_workers_that_are_interrupted_in_their_imports_are_silent(interrupted, tmp_path):
+    _, _, folder = interrupted["first"]
+    command = [sys.executable, "-c", WORKERS, folder / "study.h5", tmp_path / "fits.h5"]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, start_new_session=True
+    )
+    assert done.returncode == 130
+    assert done.stderr.splitlines() == [
+        f"etid: interrupted: {tmp_path}/fits.h5 was not written, and nothing was kept: run the "
+        "same command again"
     ]

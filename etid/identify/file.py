@@ -102,6 +102,7 @@ def _pin(cores: Any, told: Any, level: int) -> None:
     LOG.setLevel(level)
     LOG.addHandler(logging.handlers.QueueHandler(told))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {cores.get()})
 
@@ -112,6 +113,20 @@ class _Relayed(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Log it here."""
         LOG.handle(record)
+
+
+class _Processes(concurrent.futures.ProcessPoolExecutor):
+    """Processes that wait with Ctrl-C until `_pin`: within their imports it would be a traceback.
+
+    A process inherits the blocked signals of the thread that starts it, which is that of `submit`.
+    """
+
+    def submit(self, *call: Any, **named: Any) -> concurrent.futures.Future:
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return super().submit(*call, **named)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 @contextlib.contextmanager
@@ -126,9 +141,7 @@ def processes(workers: int) -> Iterator[concurrent.futures.Executor]:
     listener.start()
     try:
         arguments = cores, told, LOG.getEffectiveLevel()
-        with concurrent.futures.ProcessPoolExecutor(
-            workers, mp_context=context, initializer=_pin, initargs=arguments
-        ) as executor:
+        with _Processes(workers, context, initializer=_pin, initargs=arguments) as executor:
             yield executor
     finally:
         listener.stop()
