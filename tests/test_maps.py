@@ -74,6 +74,23 @@ def test_a_narrow_figure_has_fewer_maps_in_a_row(display):
     assert pictures.faults(axes[0].figure) == []
 
 
+@pytest.mark.parametrize("days", [("after washing with soap", "before washing"), ("d1", "d1")])
+def test_long_titles_have_room_in_the_column_of_a_paper(display, days):
+    import matplotlib.pyplot as plt
+
+    labels = {
+        "subject": np.full(6, "Anna-Maria Schmidt-Huber", object),
+        "session": np.repeat(np.array(days, object), 3),
+        "site": np.full(6, "left index finger", object),
+    }
+    fits = dataclasses.replace(display, labels={**display.labels, **labels})
+    axes = etid.plot(fits, map="r_p", size=(3.3, 4.5))
+    plt.close(axes[0].figure)
+    assert pictures.faults(axes[0].figure) == []
+    for axis in axes:  # whole words
+        assert {"index", "finger,", "electrodes"} <= {*axis.get_title("left").split()}
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -65,7 +65,10 @@ def draw_map(
     width, height = np.ptp(layout.x), np.ptp(layout.y)
     tall = 1.7 * min(max(height / max(width, 1e-9), 0.5), 4.0)
     size = (2.0 * columns + 1.4, (tall + 0.9) * rows + 0.4)
-    axes = canvas(rows, columns, size, matrix=True, sharex=True, sharey=True)
+    # Titles are broken before the layout is made, which leaves 0.55 inch for labels, 0.6 for a bar.
+    inch = 1 / min(max(wide, LEAST), size[0])
+    room = {"left": 0.55 * inch, "right": 1 - 0.6 * inch}
+    axes = canvas(rows, columns, size, matrix=True, sharex=True, sharey=True, gridspec_kw=room)
     for axis, group in zip(axes.flat, groups, strict=False):
         of = np.array([one == group for one in keys])
         shown = np.unique(place[of & good])
@@ -88,7 +91,8 @@ def draw_map(
         axis.set_ylabel("y [mm]")
     legend(axes, [key(name, mark, hollow=True) for name, mark in marks.items()])
     figure = axes.flat[0].figure
-    bar = figure.colorbar(ScalarMappable(norm, COLOURS), ax=axes, shrink=0.6, pad=0.02)
+    colours = ScalarMappable(norm, COLOURS)
+    bar = figure.colorbar(colours, ax=axes, shrink=0.6, pad=0.02, panchor=(0.0, 0.5))
     bar.set_label(symbol(element, units[element]))
     plain_ticks(bar.ax.yaxis)
     return axes.ravel()

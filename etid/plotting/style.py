@@ -160,8 +160,12 @@ def _unset(text: str) -> str:
 def wrapped(text: str, inches: float, size: float) -> str:
     """A text whose lines are broken where letters of this size [points] leave the room."""
     count = max(8, int(72 * inches / (EM * size)))
-    lines = [textwrap.wrap(line, count, break_on_hyphens=False) for line in text.split("\n")]
-    return "\n".join(line for part in lines for line in part).replace(NO_BREAK, " ")
+    lines = []
+    for line in text.split("\n"):
+        held = max(map(len, line.split(" "))) <= count  # else what belongs together is broken, too
+        free = line if held else line.replace(NO_BREAK, " ")
+        lines += textwrap.wrap(free, count, break_on_hyphens=not held)
+    return "\n".join(lines).replace(NO_BREAK, " ")
 
 
 def without_elements(axis: Axes, text: str = "no elements") -> None:
