@@ -11,17 +11,19 @@ they are wrong by 20 % only.
 import dataclasses
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 import etid
+from benchmarks.rates import Rate, rate
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.registry import named, names
 from etid.identify.options import for_calibrations
 from etid.recordings.preflight import Inspected
 from etid.results.driver import Order
+from etid.results.verdicts import counted
 
 DEFAULT = "default"
 OURS = (DEFAULT, *names())
@@ -98,6 +100,16 @@ class Answer:
     def missed(self) -> bool:
         """Whether an element is that must not be."""
         return bool((self.silent_elements & self.determined).any())
+
+
+def rate_of(answers: Sequence[Answer], event: Callable[[Answer], bool]) -> Rate:
+    """Rate of an event, with the interval of answers that share drivers."""
+    return rate([event(one) for one in answers], [one.seed for one in answers])
+
+
+def verdicts(answers: Sequence[Answer]) -> str:
+    """How often each verdict occurs, as text."""
+    return counted(np.array([one.verdict for one in answers]))
 
 
 class Drivers:

@@ -10,20 +10,19 @@ higher sample rate, more periods) gets fewer draws.
 """
 
 import argparse
-import collections
 import itertools
+import operator
 import pathlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from benchmarks import charts
-from benchmarks.estimators import DEFAULT, ELEMENTS, OURS, Answer
+from benchmarks.estimators import DEFAULT, ELEMENTS, OURS, Answer, rate_of, verdicts
 from benchmarks.failure_axes import MOST, Cell, cells
 from benchmarks.failure_draws import Effort, answers
 from benchmarks.machine import write_csv
-from benchmarks.rates import rate
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, show, tabled
 
 RATES, SILENT = "failures.csv", "silent_failures.csv"
@@ -64,18 +63,15 @@ EVENTS = {name: name for name in ("wrong", "refused", "silent", "unstable")}
 EVENTS["not_converged"] = "unsettled"
 
 
-def rates(given: Iterable[Answer]) -> dict[str, Any]:
+def rates(every: Sequence[Answer]) -> dict[str, Any]:
     """Numbers of drivers and trials, and the rate of each event with its interval.
 
     `missed` is that of silent failures of determined elements, of the trials that have any.
     """
-    every = list(given)
-    asked, seeds_of = [a for a in every if a.target], [a.seed for a in every]
-    of = {
-        name: rate([getattr(a, event) for a in every], seeds_of) for name, event in EVENTS.items()
-    }
-    of["missed"] = rate([a.missed for a in asked], [a.seed for a in asked])
-    found: dict[str, Any] = {"drivers": len({*seeds_of}), "trials": len(every)}
+    asked = [a for a in every if a.target]
+    of = {name: rate_of(every, operator.attrgetter(event)) for name, event in EVENTS.items()}
+    of["missed"] = rate_of(asked, operator.attrgetter("missed"))
+    found: dict[str, Any] = {"drivers": len({a.seed for a in every}), "trials": len(every)}
     found["determined"] = len(asked)
     for name, one in of.items():
         found |= {name: one.rate, f"{name}_low": one.low, f"{name}_high": one.high}
@@ -117,8 +113,7 @@ def targets(rows: Sequence[Mapping[str, Any]], every: Sequence[Answer]) -> Itera
             yield Target.of(TARGETS, single, row["missed_low"], after=f": {place}")
     asked = [a for a in every if a.method == DEFAULT and a.target]
     if asked:
-        missed = rate([a.missed for a in asked], [a.seed for a in asked])
-        yield Target.of(TARGETS, overall, missed)
+        yield Target.of(TARGETS, overall, rate_of(asked, operator.attrgetter("missed")))
 
 
 def ranking(every: Sequence[Answer]) -> Iterator[Target]:
@@ -183,9 +178,7 @@ def main(arguments: argparse.Namespace) -> bool:
     every = [answer for answered in found for answer in answered]
     for name in dict.fromkeys(answer.method for answer in every):
         of = [answer for answer in every if answer.method == name]
-        verdicts = collections.Counter(answer.verdict for answer in of)
-        told = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
-        show({"method": name, **rates(of), "verdicts": told})
+        show({"method": name, **rates(of), "verdicts": verdicts(of)})
     for row in failures:
         if row["method"] == DEFAULT:
             place = f"{row['map']}, {row['row']}, {row['column']}"

@@ -4,6 +4,7 @@ Every rung differs from the middle one, 60 dB, three periods at 200 kHz, trigger
 one thing.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,6 +16,7 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import Impedance, ResistorLoad
 
 LOADS = TYPICAL
+TRUTH = {path: dataclasses.astuple(skin) for path, skin in LOADS.items()}  # elements, in SI
 START = (20e3, 100e3, 0.3e-9)  # elements, in SI, of no fingertip in particular
 TRIAL = "skin/01"
 CALIBRATION = "calibration/98k8"

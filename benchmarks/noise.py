@@ -8,7 +8,6 @@ C_p relative to those with white noise.
 """
 
 import argparse
-import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
@@ -16,11 +15,10 @@ import numpy as np
 import etid
 from benchmarks.coverage import identified, targets
 from benchmarks.laboratory import Added, Flicker, Record, hum
-from benchmarks.ladder import LOADS
+from benchmarks.ladder import TRUTH
 from benchmarks.perturbed_study import all_records, both, out, undisturbed
 from benchmarks.runner import Target, option, report
 
-TRUTH = {path: dataclasses.astuple(skin) for path, skin in LOADS.items()}
 FIRST = 2000  # number of the first driver
 HUM = 0.01  # [V at the converter]
 
@@ -53,9 +51,7 @@ def studies(
 ) -> Iterator[etid.Study]:
     """A dry and a damp recording behind each driver, and its calibration."""
     for number in range(FIRST, FIRST + drivers):
-        of = all_records(change)(undisturbed(number, snr_db))
-        records = [one.recording(number) for one in (*of.calibrations, *of.trials)]
-        yield etid.Study.from_recordings(records)
+        yield all_records(change)(undisturbed(number, snr_db)).recordings()
 
 
 def main(arguments: argparse.Namespace) -> bool:

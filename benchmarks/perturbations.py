@@ -26,7 +26,6 @@ from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS, recorded
 from benchmarks.perturbation_list import AND, INVISIBLE, PERTURBATIONS, UNDISTURBED, change_of, pair
 from benchmarks.perturbed_study import PARTS, Truth, undisturbed
-from benchmarks.rates import rate
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, show, tabled
 
 TARGETS = {
@@ -117,20 +116,23 @@ def answers_of(names: Sequence[str], number: int, snr_db: float, parts: float) -
     return found
 
 
-def table(answers: Sequence[Answer], by: Sequence[str]) -> list[dict[str, Any]]:
-    """Counts for each group of answers with the same attributes `by`, in their order."""
+def grouped(answers: Sequence[Answer], by: Sequence[str]) -> dict[tuple, list[Answer]]:
+    """Answers with the same attributes `by`, in their order."""
     groups: dict[tuple, list[Answer]] = {}
     for answer in answers:
         groups.setdefault(tuple(getattr(answer, name) for name in by), []).append(answer)
+    return groups
+
+
+def table(answers: Sequence[Answer], by: Sequence[str]) -> list[dict[str, Any]]:
+    """Counts for each group of answers with the same attributes `by`."""
     rows = []
-    for key, of in groups.items():
+    for key, of in grouped(answers, by).items():
         counts = collections.Counter(map(kind, of))
         row = {**dict(zip(by, key, strict=True)), "answers": len(of)}
         row |= {name: counts[name] for name in KINDS}
         row |= _worst([answer for answer in of if kind(answer) == "silent"])
-        verdicts = collections.Counter(answer.verdict for answer in of).most_common()
-        row["verdicts"] = ", ".join(f"{count} {verdict}" for verdict, count in verdicts)
-        rows.append(row)
+        rows.append({**row, "verdicts": estimators.verdicts(of)})
     return rows
 
 
@@ -149,23 +151,17 @@ def _worst(silent: Sequence[Answer]) -> dict[str, Any]:
 def targets(answers: Sequence[Answer]) -> Iterator[Target]:
     """What the default method misses."""
     silent, refused, _ = TARGETS
-    for row in table(answers, ("perturbation", "snr_db", "path")):
-        name, place, count = row["perturbation"], (row["path"], row["snr_db"]), row[silent]
-        known = INVISIBLE.get(name)
+    for (name, path, snr_db), of in grouped(answers, ("perturbation", "path", "snr_db")).items():
+        count, known = sum(kind(one) == "silent" for one in of), INVISIBLE.get(name)
         if not count:
             continue
-        beyond = max(_beyond(of) for of in answers if _place(of) == (name, *place))
-        if not (known and known.excuses(*place, count, row["answers"], beyond)):
-            where, text = f": {name}, {place[0]} at {place[1]:g} dB", f"{count} of {row['answers']}"
+        if not (known and known.excuses(path, snr_db, count, len(of), max(map(_beyond, of)))):
+            where, text = f": {name}, {path} at {snr_db:g} dB", f"{count} of {len(of)}"
             yield Target.of(TARGETS, silent, count, after=where, text=text)
     of = [answer for answer in answers if answer.perturbation in UNDISTURBED]
     if of:
-        share = rate([kind(one) in {"refused", "said"} for one in of], [one.seed for one in of])
+        share = estimators.rate_of(of, lambda one: kind(one) in {"refused", "said"})
         yield Target.of(TARGETS, refused, share)
-
-
-def _place(of: Answer) -> tuple[Any, ...]:
-    return of.perturbation, of.path, of.snr_db
 
 
 def _beyond(of: Answer) -> float:

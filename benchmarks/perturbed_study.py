@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+import etid
 from benchmarks.laboratory import CORNER, SCALE, Nonlinear, Output, Record, exponential, noise
 from benchmarks.ladder import LOADS
 from etid.simulation.published import REFERENCE
@@ -49,6 +50,11 @@ class Study:
     calibrations: tuple[Record, ...]  # with known resistors
     trials: tuple[Record, ...]  # with skin
     truths: Mapping[str, Truth]  # of the trials, by path
+
+    def recordings(self) -> etid.Study:
+        """Its recordings; their random numbers depend on the number of the driver."""
+        every = (*self.calibrations, *self.trials)
+        return etid.Study.from_recordings([one.recording(self.number) for one in every])
 
 
 Change = Callable[[Study], Study]

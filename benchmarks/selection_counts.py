@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.estimators import Answer
+from benchmarks.estimators import Answer, rate_of
 from benchmarks.failure_axes import Cell, cells
 from benchmarks.rates import NORMAL_95, Rate, rate
 from benchmarks.selection_draws import TRUTHS, Drawn, errors
@@ -172,4 +172,4 @@ def right_from_40_db(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -
         for one in answered
         if cell.chart == OTHER_SKIN and cell.row in RIGHT_SNR
     ]
-    return rate([is_right(one) for one in asked], [one.seed for one in asked])
+    return rate_of(asked, is_right)

@@ -12,7 +12,6 @@ invisible, and a drift, which is not one error.
 """
 
 import argparse
-import dataclasses
 import pathlib
 from collections.abc import Mapping, Sequence
 
@@ -23,11 +22,10 @@ from benchmarks import perturbed_study as lab
 from benchmarks import visibility
 from benchmarks.coverage import JOINT, Draws, draw, targets
 from benchmarks.laboratory import Record
-from benchmarks.ladder import LOADS
+from benchmarks.ladder import LOADS, TRUTH
 from benchmarks.rates import rate
 from benchmarks.runner import WORKERS, Target, each, option, report
 
-TRUTH = {path: dataclasses.astuple(skin) for path, skin in LOADS.items()}
 FIRST = 5000  # number of the first driver
 SIZES = {  # [relative, F, s]
     "gain": 2e-3,
@@ -85,16 +83,11 @@ def study(
 
         def late(one: Record) -> Record:
             right = fault is not None and one.r_load is not None
-            return _after(one, 0.0 if right else SIZES["delay"] * normal())
+            after = 0.0 if right else SIZES["delay"] * normal()  # V_out after V_th
+            return lab.out(delay=one.th.delay + after)(one)
 
         of = lab.all_records(late)(of)
-    records = [one.recording(number) for one in (*of.calibrations, *of.trials)]
-    return etid.Study.from_recordings(records)
-
-
-def _after(of: Record, delay: float) -> Record:
-    """The record with V_out after V_th by this delay [s]."""
-    return lab.out(delay=of.th.delay + delay)(of)
+    return of.recordings()
 
 
 def fits_of(of: etid.Study, mode: str, instrument: etid.Instrument) -> Mapping[str, etid.Fit]:

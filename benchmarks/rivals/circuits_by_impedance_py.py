@@ -16,8 +16,8 @@ from impedance.models.circuits import (  # pyright: ignore[reportMissingImports]
 )
 
 from benchmarks.rivals import serve
+from benchmarks.rivals.records import KILO, MEGA
 
-MEGA, KILO = 1e6, 1e3
 R_S, R_P, C_P, ALPHA = 20.0, 100.0, 0.3, 0.8  # [kohm, kohm, nF, 1]
 TAU = 30.0  # [µs]
 ENOUGH = {"ftol": 1e-8, "maxfev": 1000}  # SciPy's own tolerance

@@ -7,9 +7,8 @@ ImpedanceFitter makes: its own schemes know the modulus alone. No element is a t
 import impedancefitter  # pyright: ignore[reportMissingImports]  # in its own environment
 import numpy as np
 
-from benchmarks.rivals.records import harmonics, load_impedance
+from benchmarks.rivals.records import KILO, MEGA, NANO, harmonics, load_impedance
 
-MEGA, KILO, NANO = 1e6, 1e3, 1e-9
 NAMES = ("series_R", "skin_R", "skin_C")
 impedancefitter.set_logger("WARNING")
 

@@ -10,9 +10,7 @@ from impedance.models.circuits import (  # pyright: ignore[reportMissingImports]
     CustomCircuit,
 )
 
-from benchmarks.rivals.records import harmonics, load_impedance
-
-MEGA, KILO, NANO = 1e6, 1e3, 1e-9
+from benchmarks.rivals.records import KILO, MEGA, NANO, harmonics, load_impedance
 
 
 def skin(v_th, v_out, model, start, fs, f0):

@@ -12,6 +12,7 @@ import numpy as np
 
 VISIBLE = 10.0  # power of a coefficient over that of its noise, below which an impedance is no use
 ALIASED = 0.35  # of the sample rate: above, aliases disturb records of which each period is alike
+MEGA, KILO, NANO = 1e6, 1e3, 1e-9
 MICROSECOND = 1e-6  # unit of a delay, so that all unknowns are of one order
 # [Hz] at least, of records of current and voltage: at 1 MHz the C_p of a first-order Z(z) is 0.1 %
 # (output error) to 0.4 % (equation error) off, at 200 kHz 1.3 to 6.9 %.
