@@ -4,6 +4,7 @@ Inside etid all numbers are in SI units. Only text, tables and figures use the u
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -97,6 +98,12 @@ def unexplained(rrse: float) -> str:
 def several(count: int, noun: str) -> str:
     """A number of things, such as `1 recording` or `2 recordings`."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def first_of(names: Sequence[str], most: int) -> str:
+    """The first names of a list, and how many more it has."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def quantity(value: float, unit: str, error: float = np.nan) -> str:

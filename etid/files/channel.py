@@ -12,6 +12,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from etid.circuits.display import first_of
 from etid.recordings import errors, limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import unwritable
@@ -121,9 +122,7 @@ class Contents:
 
 def listed(names: Iterable[str]) -> str:
     """Text of at most 30 names for an error message."""
-    every = list(names)
-    more = f" and {len(every) - 30} more" if len(every) > 30 else ""
-    return (", ".join(map(repr, every[:30])) or "none") + more
+    return first_of([repr(name) for name in names], 30) or "none"
 
 
 def chosen(names: Iterable[str], name: str, field: str) -> None:
@@ -239,9 +238,11 @@ class Unit(NamedTuple):
     si: str
 
 
-_MICRO = "u", "\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"
 # "M" is missing, because "MV" can be a millivolt in capital letters or a megavolt.
-_SHORT = {"": 1.0, "k": 1e3, "m": 1e-3, **dict.fromkeys(_MICRO, 1e-6), "n": 1e-9, "p": 1e-12}
+_SHORT = {
+    "": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "\N{MICRO SIGN}": 1e-6,
+    "\N{GREEK SMALL LETTER MU}": 1e-6, "n": 1e-9, "p": 1e-12,
+}  # fmt: skip
 _LONG = {"": 1.0, "kilo": 1e3, "milli": 1e-3, "micro": 1e-6, "nano": 1e-9, "pico": 1e-12}
 _SPELLINGS = {
     "volt": ("V", "volt", "volts"),

@@ -27,7 +27,6 @@ from etid.results.fits_columns import long_form
 from etid.results.hdf5_table import REMEDY, Table, check_same_length, opened_table
 
 ROWS = 1 << 16  # fits in memory at a time
-QUALITY = ("rrse", "chi2", "steps", "remarks")
 CIRCUITS = (".cir", ".json")
 
 
@@ -69,7 +68,8 @@ def export_fits(
         names = _elements(table)
         columns = _columns(table, names)
         if not all:
-            more = {f"{name}_change" for name in (*names, "amplitude")} | {*QUALITY}
+            more = {f"{name}_change" for name in (*names, "amplitude")}
+            more |= {"rrse", "chi2", "steps", "remarks"}
             columns = {name: column for name, column in columns.items() if name not in more}
         units = {name: _units(column, table) for name, column in columns.items()}
         parts = _parts(table, columns)

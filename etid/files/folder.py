@@ -31,8 +31,6 @@ from etid.recordings.replacing import replacing
 from etid.recordings.tables import rows_of
 
 TABLE = "calibrations.csv"
-_RESISTANCE = re.compile(r"(\d+)([RkM])(\d*)|(\d+(?:\.\d+)?)([RkM]?)")
-_FACTORS = {"": 1.0, "R": 1.0, "k": 1e3, "M": 1e6}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,7 +213,8 @@ def resistance(text: str, file: str, field: str = "r_load") -> float:
     Raises:
         RecordingError: The text is no resistance.
     """
-    match = _RESISTANCE.fullmatch(text.removesuffix("ohm"))
+    written = r"(\d+)([RkM])(\d*)|(\d+(?:\.\d+)?)([RkM]?)"
+    match = re.fullmatch(written, text.removesuffix("ohm"))
     if match is None:
         raise RecordingError(
             f"is {text!r}, which is no resistance",
@@ -225,9 +224,8 @@ def resistance(text: str, file: str, field: str = "r_load") -> float:
             + f", or list the file in {TABLE}" * (field == "r_load"),
         )
     whole, middle, rest, number, last = match.groups()
-    if number is not None:
-        return float(number) * _FACTORS[last]
-    return float(f"{whole}.{rest or 0}") * _FACTORS[middle]
+    factor = {"": 1.0, "R": 1.0, "k": 1e3, "M": 1e6}[last if middle is None else middle]
+    return factor * float(number or f"{whole}.{rest or 0}")
 
 
 def _table(root: pathlib.Path) -> dict[str, float]:

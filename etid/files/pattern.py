@@ -5,8 +5,6 @@ import re
 from etid.recordings.errors import RecordingError, located
 from etid.recordings.fields import LABELS, check_names
 
-_LABEL = re.compile(r"\{(\w*)\}")
-
 
 def pattern(text: str, more: tuple[str, ...] = ()) -> re.Pattern[str]:
     """Expression of the names that fit a pattern; its groups are the labels.
@@ -20,7 +18,8 @@ def pattern(text: str, more: tuple[str, ...] = ()) -> re.Pattern[str]:
     Raises:
         RecordingError: A name is unknown or occurs twice, or no text separates two labels.
     """
-    texts, names = _LABEL.split(text)[::2], _LABEL.findall(text)
+    parts = re.split(r"\{(\w*)\}", text)
+    texts, names = parts[::2], parts[1::2]
     with located(repr(text)):
         check_names(dict.fromkeys(names), (*LABELS, *more), "label")
     if len(set(names)) < len(names) or not names or "" in texts[1:-1]:

@@ -21,10 +21,8 @@ import numpy as np
 from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 
-PAGE = pathlib.Path(__file__).with_name("page.html")
 HEADER = "X-Etid-Token"
 ALIVE = 0.5  # [s] between two looks at the loop's process
-FIGURES = 4  # digits of a number on the page
 
 
 class Slot:
@@ -84,7 +82,8 @@ class _Handler(RequestHandler):
 class _Page(_Handler):
     def get(self) -> None:
         told = json.dumps(self.told, ensure_ascii=False).replace("<", "\\u003c")
-        self.finish(PAGE.read_text("utf-8").replace("{{TOLD}}", told))
+        page = pathlib.Path(__file__).with_name("page.html").read_text("utf-8")
+        self.finish(page.replace("{{TOLD}}", told))
 
 
 class _State(_Handler):
@@ -116,7 +115,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace")
     if isinstance(value, np.floating):
-        return float(f"{value:.{FIGURES}g}") if np.isfinite(value) else None
+        return float(f"{value:.4g}") if np.isfinite(value) else None
     return value.item()
 
 

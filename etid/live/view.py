@@ -17,11 +17,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from etid.circuits.display import DISPLAY, heading
+from etid.circuits.display import DISPLAY, first_of, heading
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.controller import Controller
 from etid.online.pulse_fit import GainModel
-from etid.plotting.layout import COLUMNS, PITCH, Layout
+from etid.plotting.layout import Layout, like_fingertip
 from etid.precision import in_float64
 from etid.recordings.errors import install
 from etid.results.verdicts import verdict_names
@@ -31,14 +31,8 @@ if TYPE_CHECKING:
 
 PORT = 8765
 EVERY = 0.1  # [s] between two snapshots
-LATEST = 1.0  # [s] after which a snapshot does not wait for a quick tick
-LAST = 0.5  # [s] that the windows have to see the last one
 ALARMS = 12  # alarms that are listed
-NAMED = 6  # electrodes that an alarm names
-GOOD, UNKNOWN = "good", "not identified: too_short"
-CAPS = ("peak", "charge", "guard", "voltage")  # reasons of a command that are a cap
-HIGH = 0.2  # of the largest voltage, which is exceeded where the pulse is drawn
-NANO = 1e-9
+GOOD = "good"  # state of an electrode that needs no alarm
 
 
 class LiveView:
@@ -79,14 +73,15 @@ class LiveView:
             raise ValueError(f"port is {port}; give a number from 0 to {2**16 - 1}")
         tracker = controller.tracker
         number, bands, circuit = tracker.electrodes, tracker.model.bands, tracker.model.circuit
-        layout = layout or _rows(number)
+        layout = layout or like_fingertip(number)
         if len(layout.electrodes) != number:
             raise ValueError(
                 f"the layout has {len(layout.electrodes)} electrodes, the display {number}; give "
                 "the layout of this display"
             )
         self._controller, self._controls, self._names = controller, controls, layout.electrodes
-        high = np.flatnonzero(np.abs(of := bands.waveform()) > HIGH * np.abs(of).max())
+        # A pulse is drawn where it exceeds a fifth of its peak, and half as far on both sides.
+        high = np.flatnonzero(np.abs(of := bands.waveform()) > 0.2 * np.abs(of).max())
         margin = (high[-1] - high[0]) // 2 + 1
         self._part = slice(max(high[0] - margin, 0), high[-1] + margin)
         units = {name: circuit.units()[name] for name in circuit.names()}
@@ -102,7 +97,7 @@ class LiveView:
             "token": secrets.token_urlsafe(),
             "start": secrets.token_urlsafe(),
             "controls": controls,
-            "wanted": charge / NANO,
+            "wanted": charge / 1e-9,  # [nC]
             "names": self._names,
             "x": layout.x.tolist(),
             "y": layout.y.tolist(),
@@ -127,7 +122,7 @@ class LiveView:
             self._process.start()
         self._due = self._slowest = 0.0
         self._spare = tracker.period / bands.sample_rate / 2
-        self._words = [UNKNOWN] * number
+        self._words = ["not identified: too_short"] * number
         self._alarms: deque[str] = deque(maxlen=ALARMS)
         self._compile()
 
@@ -153,7 +148,7 @@ class LiveView:
             self._alarms.appendleft(pulse + text)
         self._slowest = max(self._slowest, tick.seconds)
         now = time.monotonic()
-        wait = now < self._due or (tick.seconds > self._spare and now < self._due + LATEST)
+        wait = now < self._due or (tick.seconds > self._spare and now < self._due + 1.0)
         if wait and not tick.stopped:
             return
         self._due = now + EVERY
@@ -167,7 +162,7 @@ class LiveView:
         known = np.asarray(state.pulses) > 0
         of["elements"] = np.where(known, np.exp(own[:, :-1].T) / self._scale[:, None], np.nan)
         if not tick.stopped:  # its command is 0, which tells no charge of the pulse before
-            of["charge"] = self._given(tick) / NANO
+            of["charge"] = self._given(tick) / 1e-9
         of["words"] = [word.encode() for word in self._words]
         of["v_out"] = tick.window[at, self._part]
         of["predicted"] = self._predicted(tick, at)
@@ -177,7 +172,7 @@ class LiveView:
 
     def close(self) -> None:
         """End the page, after its windows had the time to see the last snapshot."""
-        time.sleep(LAST if self._process.is_alive() else 0)
+        time.sleep(0.5 if self._process.is_alive() else 0)
         self._process.terminate()
         self._process.join()
 
@@ -201,7 +196,8 @@ class LiveView:
             for verdict in verdict_names(state.electrodes.result)
         ]
         if self._controls:
-            for at in np.flatnonzero(np.isin(tick.command.reason, CAPS)):
+            caps = ("peak", "charge", "guard", "voltage")
+            for at in np.flatnonzero(np.isin(tick.command.reason, caps)):
                 words[at] = f"cap reached: {tick.command.reason[at]}"
         for at, reason in tracker.bad_electrodes(state).items():
             words[at] = "contact lost" if reason == "open" else reason
@@ -212,9 +208,8 @@ class LiveView:
         for word in dict.fromkeys(words):
             new = [at for at, now in enumerate(words) if now == word != self._words[at]]
             if new and word != GOOD:
-                more = f" and {len(new) - NAMED} more" if len(new) > NAMED else ""
-                names = ", ".join(self._names[at] for at in new[:NAMED])
-                self._alarms.appendleft(f"{pulse}{word}, at {names}{more}")
+                names = first_of([self._names[at] for at in new], 6)
+                self._alarms.appendleft(f"{pulse}{word}, at {names}")
         self._words = words
 
     def _given(self, tick: "Tick") -> Float[np.ndarray, " lane"]:
@@ -247,9 +242,3 @@ class LiveView:
 @jax.jit
 def _undelayed(model: GainModel, own: Float[Array, " own"]) -> Complex[Array, " band"]:
     return model.undelayed(LoadUnknowns.of(own).log_elements)
-
-
-def _rows(electrodes: int) -> Layout:
-    """Electrodes in rows as those of the paper's display."""
-    whole = Layout.grid(-(-electrodes // COLUMNS), COLUMNS, PITCH)
-    return Layout(whole.electrodes[:electrodes], whole.x[:electrodes], whole.y[:electrodes])

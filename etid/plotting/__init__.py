@@ -113,21 +113,12 @@ def plot(
         ValueError: `x` is empty, the picture needs another number of axes, or `size` is given
             together with `axes`.
     """
-    from etid.plotting.style import new_figure, titled
+    from etid.plotting.style import Canvas, titled
 
     if axes is not None and size is not None:
         raise ValueError("size is that of a new figure; set the size of the figure of your axes")
-    given = None if axes is None else np.asarray(axes, dtype=object).ravel()
-
-    def canvas(rows: int, columns: int, usual: tuple[float, float], **options: Any) -> np.ndarray:
-        if given is None:
-            return new_figure(rows, columns, size or usual, pyplot=True, **options)[1]
-        if given.size != rows * columns:
-            raise ValueError(f"axes holds {given.size} Axes; this picture takes {rows * columns}")
-        return given.reshape(rows, columns)
-
-    wide = np.inf if size is None else size[0]
-    drawn = _draw(canvas, x, recording, driver, show=show, by=by, map=map, layout=layout, wide=wide)
+    canvas = Canvas(axes, size, pyplot=True)
+    drawn = _draw(canvas, x, recording, driver, show=show, by=by, map=map, layout=layout)
     if title != "":
         for axis in drawn.flat:
             axis.set_title("", loc="left")
@@ -139,12 +130,9 @@ def figure_of(
     x: Drawable, recording: Recording | None = None, driver: Driver | None = None, **options: Any
 ) -> "matplotlib.figure.Figure":
     """The picture of `plot`, on a figure outside of `matplotlib.pyplot`; same arguments."""
-    from etid.plotting.style import new_figure
+    from etid.plotting.style import Canvas
 
-    def canvas(*grid: Any, **options: Any) -> np.ndarray:
-        return new_figure(*grid, **options)[1]
-
-    return _draw(canvas, x, recording, driver, **options)[0].figure
+    return _draw(Canvas(), x, recording, driver, **options)[0].figure
 
 
 @np.errstate(all="ignore")  # a fit that failed may hold any number
@@ -158,7 +146,6 @@ def _draw(
     by: Sequence[str] | None = None,
     map: str | None = None,
     layout: "Layout | str | os.PathLike[str] | None" = None,
-    wide: float = np.inf,
 ) -> np.ndarray:
     import matplotlib as mpl
 
@@ -216,7 +203,7 @@ def _draw(
             case Fits(), None, None if map is not None:
                 places = FINGERTIP if layout is None else layout
                 places = places if isinstance(places, Layout) else read_layout(places)
-                return maps.draw_map(canvas, x, map, places, wide)
+                return maps.draw_map(canvas, x, map, places)
             case Fits(), None, None:
                 return elements.draw_fits(canvas, x, by or ("subject", "condition"))
             case Posterior(), None, None:

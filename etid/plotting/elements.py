@@ -27,10 +27,10 @@ from etid.plotting.style import (
 from etid.recordings.fields import LABELS, check_names
 from etid.results.fits import Fits
 from etid.results.posterior import Posterior, Profile
+from etid.results.verdicts import counted
 from etid.simulation.bound import Bound
 
 LEVEL = 0.95
-FEW = 3  # the least number of fits that have a variation
 
 
 def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
@@ -58,7 +58,8 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
             (trials,) = np.nonzero((second == label) & (place == group))
             if trials.size > 1:
                 x[trials] += width * np.linspace(-0.35, 0.35, trials.size)
-    summary = [one for one in fits.summary(*by) if one["successful"] >= FEW]
+    # Fewer fits have no variation.
+    summary = [one for one in fits.summary(*by) if one["successful"] >= 3]
     middle = [groups.tolist().index(one[by[0]]) + beside[one[by[1]]] for one in summary]
     good = fits.verdicts == "successful"
     for axis, (name, unit) in zip(axes, units.items(), strict=True):
@@ -104,8 +105,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
     axes[-1].set_xlabel(by[0])
     _legend(axes, list(map(plain, series)), "" if good.all() else "without success")
-    counted = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
-    lines = [f"{len(fits)} fits: {counted}; bars: one standard error"]
+    lines = [f"{len(fits)} fits: {counted(fits.verdicts)}; bars: one standard error"]
     if summary:
         lines.append("thick: medians, and the variation between fits beyond their errors")
     titled(axes[0], lines, good=bool(good.any()))

@@ -16,14 +16,14 @@ from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.solvers.matrices import log_stderr
 
-LOWEST, HIGHEST = 60.0, 100e3  # [Hz] the paper's pulse rate and half its sample rate
 POINTS = 300
 
 
 def draw_bode(canvas: Canvas, things: Mapping[str, Impedance]) -> np.ndarray:
     """Magnitude and phase of impedances (the paper's figure 9), with bands."""
     magnitude, phase = axes = canvas(2, 1, (6.0, 5.0), sharex=True).ravel()
-    frequency = jax.device_put(np.geomspace(LOWEST, HIGHEST, POINTS))
+    # From the paper's pulse rate to half its sample rate.
+    frequency = jax.device_put(np.geomspace(60.0, 100e3, POINTS))
     kilohertz = np.asarray(frequency) / 1e3
     sizes, banded, failed = [], False, []
     for i, (label, thing) in enumerate(things.items()):

@@ -11,8 +11,6 @@ from jaxtyping import Float
 from etid.recordings.errors import RecordingError, located, optional, require_file
 from etid.recordings.tables import rows_of
 
-COLUMNS, PITCH = 7, 2e-3  # electrodes in a row of the paper's display, and their distance [m]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Layout:
@@ -75,10 +73,14 @@ class Layout:
         return np.array([rows[str(name)] for name in names], int)
 
 
-FINGERTIP = Layout.grid(14, COLUMNS, PITCH)
-"""The paper's display: 98 electrodes, 2 mm apart, on 26 x 12 mm²."""
+def like_fingertip(electrodes: int) -> Layout:
+    """Electrodes in rows as those of the paper's display."""
+    whole = Layout.grid(-(-electrodes // 7), 7, 2e-3)
+    return Layout(whole.electrodes[:electrodes], whole.x[:electrodes], whole.y[:electrodes])
 
-_UNITS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
+
+FINGERTIP = like_fingertip(98)
+"""The paper's display: 98 electrodes, 2 mm apart, on 26 x 12 mm²."""
 
 
 def read_layout(path: str | os.PathLike[str]) -> Layout:
@@ -119,5 +121,5 @@ def _of_probe(file: pathlib.Path) -> Layout:
         if len(probes) != 1 or probes[0].ndim != 2:
             raise RecordingError("must hold one planar probe")
         [probe] = probes
-        places = _UNITS[probe.si_units] * probe.contact_positions
-        return Layout(probe.contact_ids.tolist(), *places.T)
+        unit = {"um": 1e-6, "mm": 1e-3, "m": 1.0}[probe.si_units]
+        return Layout(probe.contact_ids.tolist(), *(unit * probe.contact_positions).T)

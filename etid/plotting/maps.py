@@ -26,25 +26,20 @@ from etid.results.fits import Fits
 
 COLOURS = "cividis"  # readers with and without red-green blindness see it alike
 BY = ("subject", "session", "site", "condition")  # a map for each combination
-ROW = 6  # maps side by side
 LEAST = 1.5  # [inch] width of a map
-DOT = 0.9  # diameter of an electrode, relative to the distance of neighbours
 
 
-def draw_map(
-    canvas: Canvas, fits: Fits, element: str, layout: Layout, wide: float = np.inf
-) -> np.ndarray:
+def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.ndarray:
     """An element at each electrode, a map for each subject, session, site and condition.
 
     The colour is the median of the successful trials of an electrode, on one logarithmic scale for
     all maps. An electrode without a successful trial has a mark of its own for each verdict.
 
     Args:
-        canvas: Makes the axes.
+        canvas: Makes the axes; a narrow figure has fewer maps in a row.
         fits: The fits.
         element: Name of the element.
         layout: Places of the electrodes.
-        wide: Width of the figure [inch], if it is given; a narrow one has fewer maps in a row.
 
     Raises:
         ValueError: There is no such element, or an electrode has no place.
@@ -60,13 +55,13 @@ def draw_map(
     norm = LogNorm(*(_round(values[good]) if good.any() else (1.0, 10.0)))
     bad = sorted({str(verdict) for verdict in fits.verdicts[~good]} - {"successful"})
     marks = {verdict: nth(MARKS[1:], number) for number, verdict in enumerate(bad)}
-    columns = min(len(groups), max(1, int(min(wide / LEAST, ROW))))
+    columns = min(len(groups), max(1, int(min(canvas.width / LEAST, 6))))
     rows = -(-len(groups) // columns)
     width, height = np.ptp(layout.x), np.ptp(layout.y)
     tall = 1.7 * min(max(height / max(width, 1e-9), 0.5), 4.0)
     size = (2.0 * columns + 1.4, (tall + 0.9) * rows + 0.4)
     # Titles are broken before the layout is made, which leaves 0.55 inch for labels, 0.6 for a bar.
-    inch = 1 / min(max(wide, LEAST), size[0])
+    inch = 1 / min(max(canvas.width, LEAST), size[0])
     room = {"left": 0.55 * inch, "right": 1 - 0.6 * inch}
     axes = canvas(rows, columns, size, matrix=True, sharex=True, sharey=True, gridspec_kw=room)
     for axis, group in zip(axes.flat, groups, strict=False):
@@ -120,8 +115,9 @@ def _electrodes(
     axis.set_aspect("equal")
     axis.grid(False)
     axis.plot(x, y, ".", ms=2, color="0.75", zorder=1)
+    size = [0.9 * pitch]  # neighbours do not touch each other
     dots = EllipseCollection(
-        [DOT * pitch], [DOT * pitch], [0.0], units="x", cmap=COLOURS, norm=norm, array=values,
+        size, size, [0.0], units="x", cmap=COLOURS, norm=norm, array=values,
         offsets=np.column_stack([x[shown], y[shown]]), offset_transform=axis.transData,
         zorder=2,
     )  # fmt: skip

@@ -5,6 +5,7 @@ prints stay readable. The background is always white: a dark style of the reader
 curves on a dark background.
 """
 
+import dataclasses
 import io
 import os
 import pathlib
@@ -26,13 +27,12 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from etid.circuits.display import heading
 from etid.recordings.replacing import replacing
+from etid.results.data import AnyAxes, Size
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 
 NARROW = 2.0  # [inch] columns of panels that would be narrower stand below each other
-TICKS = 1.3  # largest number of ticks over an inch: five digits have room between two
 NO_BREAK = "\u00a0"
-MARGIN = 0.75  # [inch] left of axes with labels, about
 EM = 0.55  # mean width of a character, relative to the size of the font
 INK = "#1a1a1a"
 BLUE = "#0b62a4"
@@ -54,16 +54,46 @@ PAPER: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8,
 }
-SVG: Any = {"svg.hashsalt": "etid"}
 
 # A letter with an index, or a time constant: no part of a path or of another word.
 _SYMBOL = re.compile(
     r"(?<![\w/.$\\])(?:[A-Za-z]_[A-Za-z0-9]{1,3}|tau(?:_\w)?|alpha(?:_\w)?)(?![\w/.])"
 )
 
-# Returns the axes of a picture, [row, column]. Its arguments are rows, columns, size [inch] and
-# options of `Figure.subplots`.
-Canvas = Callable[..., np.ndarray]
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Canvas:
+    """Makes the axes of a picture, [row, column], or has those of the caller.
+
+    Attributes:
+        axes: Axes to draw on; without them, a figure is made.
+        size: Width and height of this figure [inch], in place of the usual one.
+        pyplot: As in `new_figure`.
+    """
+
+    axes: AnyAxes = None
+    size: Size = None
+    pyplot: bool = False
+
+    @property
+    def width(self) -> float:
+        """Width of the figure [inch]; infinite if the picture chooses it."""
+        return np.inf if self.size is None else self.size[0]
+
+    def __call__(
+        self, rows: int, columns: int, usual: tuple[float, float], **options: Any
+    ) -> np.ndarray:
+        """The axes; `options` as `new_figure` takes them.
+
+        Raises:
+            ValueError: The caller has another number of axes.
+        """
+        if self.axes is None:
+            return new_figure(rows, columns, self.size or usual, pyplot=self.pyplot, **options)[1]
+        given = np.asarray(self.axes, dtype=object)
+        if given.size != rows * columns:
+            raise ValueError(f"axes holds {given.size} Axes; this picture takes {rows * columns}")
+        return given.reshape(rows, columns)
 
 
 def new_figure(
@@ -100,7 +130,8 @@ def new_figure(
             axes = _stacked(figure, rows, columns, **options)
             columns = 1
         for axis in axes.flat:
-            axis.locator_params(axis="x", nbins=int(np.clip(TICKS * size[0] / columns, 2, 9)))
+            # 1.3 ticks over an inch: five digits have room between two.
+            axis.locator_params(axis="x", nbins=int(np.clip(1.3 * size[0] / columns, 2, 9)))
             # matplotlib makes ticks later, and would then use the reader's style.
             axis.grid(True, color="0.9", linewidth=0.6)
             axis.tick_params(which="both", colors=INK)
@@ -239,7 +270,8 @@ def titled(axis: Axes, lines: Sequence[str], *, good: bool = True, beside: bool 
         beside: Whether axes on the right have titles too, so that lines are broken before them.
     """
     panel, whole, dpi = axis.bbox, axis.figure.bbox, axis.figure.dpi
-    room = panel.width if beside else min(whole.x1 - panel.x0, whole.width - MARGIN * dpi)
+    # Axes with labels have about 0.75 inch on the left.
+    room = panel.width if beside else min(whole.x1 - panel.x0, whole.width - 0.75 * dpi)
     text = wrapped("\n".join(filter(None, lines)), room / dpi, size := 9.0)
     axis.set_title(typeset(text), loc="left", fontsize=size, color=INK if good else RED)
 
@@ -267,7 +299,8 @@ def judged(axis: Axes, path: str, found: Fit | Driver, *more: str) -> None:
 def svg(figure: Figure) -> bytes:
     """A figure as SVG without dates and random names, so that equal figures give equal files."""
     buffer, dpi = io.BytesIO(), figure.dpi
-    with mpl.rc_context(SVG), warnings.catch_warnings():
+    usual: Any = {"svg.hashsalt": "etid"}
+    with mpl.rc_context(usual), warnings.catch_warnings():
         # Names in a foreign script stand in the tables, too.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         # `savefig` would draw a figure twice, the first time for its layout alone.

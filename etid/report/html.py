@@ -101,10 +101,6 @@ class Section:
         return re.sub(r"[^a-z0-9]+", "-", self.heading.lower()).strip("-")
 
 
-def _paragraphs(text: str) -> list[str]:
-    return [paragraph for paragraph in text.split("\n\n") if paragraph]
-
-
 def _marked(text: str) -> markupsafe.Markup:
     """Escaped text, with what stands between backticks as code."""
     return markupsafe.Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(markupsafe.escape(text))))
@@ -119,7 +115,7 @@ def template(name: str) -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    of.filters |= {"marked": _marked, "paragraphs": _paragraphs}
+    of.filters["marked"] = _marked
     return of.get_template(name)
 
 

@@ -21,7 +21,7 @@ from etid.recordings.study import Study
 from etid.report import figures
 from etid.report import tables as study_tables
 from etid.report.budget import budgets
-from etid.report.html import Picture, Section, write_page
+from etid.report.html import Picture, Section, Table, write_page
 from etid.report.methods import methods_section, succeeded, words
 from etid.report.waveforms import find, relative_stderr, waveforms
 from etid.results.fits import Fits
@@ -230,7 +230,8 @@ def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
         caption = "All fits with their standard errors; hollow without success."
         alt = "Each element of each fit by subject and condition, with standard errors."
         pictures = (Picture(caption, figures.each_fit(fits), alt, whole=True),)
-    return _grouped("Subjects", text, groups, ("subject", "condition"), fits, pictures)
+    more, table = _grouped(fits, groups, ("subject", "condition"))
+    return Section("Subjects", text + more, (table,), pictures)
 
 
 def _electrodes(fits: Fits, layout: Layout) -> list[Section]:
@@ -238,13 +239,13 @@ def _electrodes(fits: Fits, layout: Layout) -> list[Section]:
     if len(names) < 2:
         return []
     by = ("electrode", "condition")
-    rows = fits.summary(*by)
+    more, table = _grouped(fits, fits.summary(*by), by)
     if not names <= set(layout.electrodes):
         text = (
             "The same by electrode. Subjects are part of what varies here. For maps, give the "
             "places of the electrodes: etid report --layout FILE."
         )
-        return [_grouped("Electrodes", text, rows, by, fits, ())]
+        return [Section("Electrodes", text + more, (table,))]
     shown, count = figures.mapped(fits)
     text = (
         "Median of the successful trials of each electrode, on one scale. The table has the same "
@@ -261,27 +262,22 @@ def _electrodes(fits: Fits, layout: Layout) -> list[Section]:
         )
         for name in fits.circuit.units()
     )
-    return [_grouped("Electrodes", text, rows, by, fits, pictures, folded=True)]
+    folded = dataclasses.replace(table, folded=True)
+    return [Section("Electrodes", text + more, (folded,), pictures)]
 
 
 def _grouped(
-    heading: str,
-    text: str,
-    rows: Sequence[Mapping[str, Any]],
-    by: tuple[str, ...],
-    fits: Fits,
-    pictures: tuple[Picture, ...],
-    *,
-    folded: bool = False,
-) -> Section:
+    fits: Fits, rows: Sequence[Mapping[str, Any]], by: tuple[str, ...]
+) -> tuple[str, Table]:
+    """The table of a summary by labels, and what to say if it does not show all groups."""
+    text = ""
     if len(rows) > study_tables.ROWS:
         call = ", ".join(f'"{name}"' for name in by)
-        text += (
+        text = (
             f" {study_tables.ROWS} of {len(rows)} groups are shown, those with the largest share "
             f"of fits without success; etid.Fits.summary({call}) has all."
         )
-    table = study_tables.groups(rows, by, fits.circuit.units())
-    return Section(heading, text, (dataclasses.replace(table, folded=folded),), pictures)
+    return text, study_tables.groups(rows, by, fits.circuit.units())
 
 
 def _quality(fits: Fits) -> Section:
@@ -334,6 +330,4 @@ def _recordings(fits: Fits, waveforms: Section) -> Section:
             f" {study_tables.SINGLE} of {len(fits)} recordings are shown: those without success, "
             "and every few of the others. The file of fits has all."
         )
-    table = study_tables.recordings(fits, links)
-    folded = len(table.rows) > study_tables.FOLDED
-    return Section("Recordings", text, (dataclasses.replace(table, folded=folded),))
+    return Section("Recordings", text, (study_tables.recordings(fits, links),))

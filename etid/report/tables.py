@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from etid.circuits.display import between, heading, plus_minus, scaled
+from etid.circuits.display import between, first_of, heading, plus_minus, scaled
 from etid.recordings.fields import LABELS
 from etid.report.html import Table
 from etid.results.driver import ContinuousDriver, Driver
@@ -22,7 +22,6 @@ from etid.results.verdicts import message, own_part
 ROWS = 100  # largest number of rows of a table
 CONDITIONS = 30  # largest number of conditions in a table
 SINGLE = 3000  # largest number of rows of the table of recordings
-FOLDED = 30  # rows of it from which on the page shows it when the reader asks for it
 
 
 def significant(value: float, digits: int = 2) -> str:
@@ -68,7 +67,7 @@ def drivers(
         "|Z_th| at 1 kHz [kΩ]", "remark",
     )  # fmt: skip
     rows = [
-        (_calibrations(paths), "", "", "", "failed", "", "", "", text)
+        (first_of(paths, 4), "", "", "", "failed", "", "", "", text)
         for paths, text in failures.items()
     ]
     frequency = jax.device_put(np.array([1e3]))
@@ -80,7 +79,7 @@ def drivers(
         resistors = np.asarray(own).tolist()
         rows.append(
             (
-                _calibrations(paths),
+                first_of(paths, 4),
                 ", ".join(f"{r / 1e3:.6g}" for r in resistors),
                 str(driver.order),
                 driver.method,
@@ -100,11 +99,6 @@ def _without_empty(
     """Headings and rows, without the last column if it is empty."""
     end = None if any(row[-1] for row in rows) else -1
     return tuple(heads[:end]), tuple(tuple(row[:end]) for row in rows)
-
-
-def _calibrations(paths: Sequence[str]) -> str:
-    shown = ", ".join(paths[:4])
-    return shown if len(paths) <= 4 else f"{shown} and {len(paths) - 4} more"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -282,7 +276,8 @@ def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
             )
         )
     heads += ["χ²", "RRSE [%]", "note"]
-    return Table(*_without_empty(heads, rows), searchable=True, links=links)
+    shown = _without_empty(heads, rows)
+    return Table(*shown, searchable=True, folded=len(rows) > 30, links=links)
 
 
 def single(fits: Fits) -> Table:

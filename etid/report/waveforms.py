@@ -19,8 +19,6 @@ from etid.results.fit import Fit
 from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits, sha256
 
-FAILED, STRAINED, UNCERTAIN = 6, 2, 2  # largest number of fits of each kind
-
 
 def find(
     found: StudyFits, file: pathlib.Path | None, given: str | os.PathLike[str] | Study | None
@@ -143,7 +141,7 @@ def relative_stderr(fits: Fits) -> np.ndarray:
 
 
 def worst(fits: Fits) -> dict[int, str]:
-    """Rows of the worst fits, with the reason: no success, then large χ², then large errors.
+    """Rows of the worst fits, with the reason: 6 without success, 2 of large χ², 2 of large errors.
 
     The fits without success have different verdicts if possible, frequent verdicts first. One cause
     with many recordings therefore does not hide another. Among the fits with one verdict, the
@@ -152,17 +150,15 @@ def worst(fits: Fits) -> dict[int, str]:
     names = fits.verdicts
     chi2 = np.where(np.isfinite(fits.chi2), fits.chi2, -np.inf)
     failing = [_largest(chi2, names == name) for name in fits.counts() if name != "successful"]
-    in_turn = itertools.chain.from_iterable(
-        itertools.zip_longest(*(rows[:FAILED] for rows in failing))
-    )
+    in_turn = itertools.chain.from_iterable(itertools.zip_longest(*(rows[:6] for rows in failing)))
     failed = [row for row in in_turn if row is not None]
-    taken = dict.fromkeys(failed[:FAILED], "without success")
-    for size, count, reason in (
-        (chi2, STRAINED, "largest χ² among the successful"),
-        (relative_stderr(fits), UNCERTAIN, "largest standard error among the successful"),
+    taken = dict.fromkeys(failed[:6], "without success")
+    for size, reason in (
+        (chi2, "largest χ² among the successful"),
+        (relative_stderr(fits), "largest standard error among the successful"),
     ):
         rows = _largest(size, (names == "successful") & np.isfinite(size))
-        taken |= dict.fromkeys([row for row in rows if row not in taken][:count], reason)
+        taken |= dict.fromkeys([row for row in rows if row not in taken][:2], reason)
     return taken
 
 
