@@ -63,7 +63,6 @@ d = ∂G/∂α √w / σ, and a spread below `SPREAD` does not matter.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import scipy
 from jaxtyping import Array, Bool, Float, Int
@@ -207,14 +206,7 @@ class PulseScores(NamedTuple):
         freedom = 2 * jnp.sum(pulse.weight > 0, dtype=score.dtype) - others.shape[1] - 1
         explained = score**2 / jnp.where(tested, information, 1.0)
         chi2 = (residual @ residual - explained) / freedom
-        # ∂G/∂ log Z_th = −G (1 − G)
-        free = jax.lax.complex(*jnp.split(d, 2, axis=1))
-        towards = free * jnp.conj(gain * weight * (1 - gain))[None, :]
-        of_source = jnp.tensordot(model.source_error.real, towards.real, [[1], [1]])
-        of_source = of_source + jnp.tensordot(model.source_error.imag, towards.imag, [[1], [1]])
-        if model.faults is not None:
-            direct = weight[None, :] * model.by_fault(gain)
-            of_source = of_source - model.faults @ (direct @ jnp.conj(free).T).real
+        of_source = real_parts(model.by_error(gain) * weight[None, :]) @ d.T
         of_x = power(gain) * model.bands.variance_x / variance
         common = jnp.sqrt(jnp.sum(of_source**2, axis=0) + d**2 @ jnp.tile(of_x, 2))
         # More noise than stated lessens the weight of a pulse, as it does in a fit of a record.
