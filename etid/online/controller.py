@@ -58,7 +58,7 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.arguments import number_of, require
 from etid.online.current import CurrentModel
 from etid.online.state import ElectrodeState, TrackerState
-from etid.online.tracker import Tracker
+from etid.online.tracker import Tracker, for_each
 from etid.precision import in_float64
 from etid.results.verdicts import counts
 from etid.solvers.matrices import inverse_of_few
@@ -273,14 +273,8 @@ class Controller(Overviewed):
         self.tracker.check(state)
         if (charge is None) == (current is None):
             raise ValueError("give either charge or current")
-        given = np.asarray(charge if current is None else current, float)
-        if given.shape not in ((), (self.tracker.electrodes,)):
-            raise ValueError(
-                f"the wanted numbers have shape {given.shape}; give one, or one for each of "
-                f"{self.tracker.electrodes} electrodes"
-            )
-        if not (np.isfinite(given) & (given >= 0)).all():
-            raise ValueError(f"{given} is wanted; it must be finite and not negative")
+        name, given = ("current", current) if charge is None else ("charge", charge)
+        given = for_each(name, given, self.tracker.electrodes)
         wanted = given if current is None else given * self.model.phase
         if (wanted > self.most).any():
             raise ValueError(
@@ -288,7 +282,6 @@ class Controller(Overviewed):
                 f"{self.most:.3g} C in a phase. Are the numbers in coulomb or ampere, and not in "
                 "nC or mA?"
             )
-        wanted = np.full(self.tracker.electrodes, wanted)
         amplitude, expected, stderr, peak, reason = np.array(
             _commanded(
                 self.tracker.model.circuit,

@@ -103,17 +103,16 @@ class GainModel(eqx.Module):
         faults = None if known.faults is None else independent @ known.faults[1]
         return cls(circuit, bands, source, source_alias, turn, turns, freedom, error, faults)
 
-    def by_fault(self, gain: Complex[Array, " band"]) -> Complex[Array, "3 band"]:
-        """Changes of a gain by gain, crosstalk and capacitance of the instrument."""
-        # ∂G/∂C = −s Z_L² ∂G/∂Z_L
-        by_capacitance = -frequency_variable(self.bands.frequency) * self.source * gain**2
-        return jnp.stack([gain, jnp.ones_like(gain), by_capacitance])
-
     def by_error(self, gain: Complex[Array, " band"]) -> Complex[Array, "z band"]:
         """Changes of a gain by each independent error of calibrations and instrument."""
         # ∂G/∂ log Z_th = −G (1 − G)
         found = (gain * (gain - 1))[None, :] * self.source_error
-        return found if self.faults is None else found + combined(self.faults, self.by_fault(gain))
+        if self.faults is None:
+            return found
+        # ∂G/∂C = −s Z_L² ∂G/∂Z_L
+        by_capacitance = -frequency_variable(self.bands.frequency) * self.source * gain**2
+        by_fault = jnp.stack([gain, jnp.ones_like(gain), by_capacitance])
+        return found + combined(self.faults, by_fault)
 
     def expected(self, logs: Float[Array, " element"]) -> "Expected":
         """The gain of a load, and its derivatives."""
