@@ -4,6 +4,8 @@ The truth is a differential equation of the skin under a current source, solved 
 in time; harmonic balance and fits know nothing of it.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,10 +17,15 @@ from scipy.special import erf
 import etid
 from benchmarks import amplitudes as amplitudes_benchmark
 from etid.circuits.current_dependent import Norton, Signals, port
+from etid.estimators.amplitudes.terms import Amplitudes, with_filter
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.identify.amplitudes import leaves_much
 from etid.numpy_tier import tiers
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
+from etid.results.driver import HarmonicDriver
+from etid.results.feed import SourceImpedance
+from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import frequency_variable
 from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
 
@@ -27,6 +34,7 @@ SAMPLE_RATE, PULSE_RATE = 200e3, 60.0
 # Three periods in which everything is slower: few harmonics, so that a fit is cheap. `AT` is the
 # time of the skin and of its pulses. All have three records, for each number of them compiles.
 SLOW_RATE, SLOWER = 20e3, 8
+HARMONICS = 116  # up to 0.35 of the slow rate
 AT = np.arange(1000) / SLOW_RATE % (1 / PULSE_RATE) / SLOWER
 SKIN = etid.SkinCurrent(r_s=895.0, r_p=60.1e3, c_p=1e-9, i_0=0.585e-3)  # Kaczmarek and Webster 1989
 
@@ -108,6 +116,86 @@ def test_a_large_i_0_is_a_linear_load():
     peak = np.abs(np.asarray(linear)).max()
     np.testing.assert_allclose(signals.voltage, linear, atol=1e-7 * peak)
     np.testing.assert_allclose(signals.current * z, linear, atol=1e-7 * peak)
+
+
+def behind_a_driver(amplitude: float, elements: np.ndarray) -> np.ndarray:
+    """Fourier coefficients of V_out [V] behind 12 kΩ + 20 kΩ / (1 + s 0.2 ms), by LSODA.
+
+    The pulses are slower by `SLOWER`. Skin and driver are at rest long before the next one.
+    """
+    r_s, r_p, c_p, i_0 = elements.tolist()
+
+    def current(t: float | np.ndarray, u: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return (amplitude * pulses(np.asarray(t) / SLOWER) - u - w) / (12e3 + r_s)
+
+    def slope(t: float, state: np.ndarray) -> list[np.ndarray]:
+        u, w = state
+        through = u / (r_p * (1 - np.abs(u) / (r_p * i_0)))
+        i = current(t, u, w)
+        return [(i - through) / c_p, (20e3 * i - w) / 0.2e-3]
+
+    t = np.arange(2048) / 2048 / PULSE_RATE
+    found = solve_ivp(
+        slope, (0, 1 / PULSE_RATE), np.zeros(2), method="LSODA", rtol=1e-9, atol=1e-9,
+        max_step=1e-4, t_eval=t,
+    )  # fmt: skip
+    u, w = found.y
+    return coefficients(u + r_s * current(t, u, w))
+
+
+def coefficients(v: np.ndarray) -> np.ndarray:
+    """Fourier coefficients of one period at the harmonics of a slow record."""
+    return np.fft.rfft(v, norm="forward")[1 : HARMONICS + 1]
+
+
+def test_terms_and_their_slopes_agree_with_steps_in_time():
+    """Two amplitudes behind a driver and an anti-alias filter, each with its trigger delay."""
+    truth, amplitudes = np.array([895.0, 60.1e3, SLOWER * 1e-9, 0.4e-3]), np.array([20.0, 150.0])
+    f, delays = PULSE_RATE * np.arange(1.0, HARMONICS + 1), np.array([0.4, -0.3])
+    passed = butterworth(f, 0.3, SLOW_RATE)
+    turned = passed * np.exp(-2j * np.pi * delays[:, None] * f / SLOW_RATE)
+
+    def outputs(elements: np.ndarray) -> np.ndarray:
+        return turned * np.stack([behind_a_driver(one, elements) for one in amplitudes])
+
+    y, ones = outputs(truth), np.ones((2, HARMONICS))
+    unit = coefficients(pulses(np.arange(2048) / 2048 / PULSE_RATE / SLOWER))
+    x, used = amplitudes[:, None] * passed * unit, f * ones < 5e3
+    none = jnp.zeros(0)
+    feed = object.__new__(HarmonicDriver)  # only its source is read
+    r_th, g, omega = jnp.log(12e3), jnp.array([20e3]), jnp.log(jnp.array([1 / 0.2e-3]))
+    source = SourceImpedance(r_th, none, none, none, none, omega, g)
+    object.__setattr__(feed, "source", source)
+    known = GivenDriver.measured(jnp.asarray(f))
+    loaded = source.response(jnp.asarray(f)) + 50e3
+    known = dataclasses.replace(known, loaded=loaded, resistance=jnp.array(50e3), by_current=False)
+    of = Amplitudes(
+        given=with_filter(known),
+        feed=feed,
+        circuit=etid.SkinCurrent(),
+        spectra=Spectrum(*map(jnp.asarray, (f * ones, x, y, ones, ones, used))),
+        sample_rate=jnp.array(SLOW_RATE),
+        expected=jnp.asarray(0.08 * ones),
+    )
+    filters = np.array([0.0, 1.2 * np.arctanh(1 / 1.2)])  # the second one alone
+    q = jnp.asarray(np.concatenate([np.log(truth), delays, filters]))
+    predicted, slopes = map(np.asarray, tiers.program(of.slopes)(q))
+    peak = np.abs(y).max(axis=1, keepdims=True)
+    # The balance has no harmonics beyond 14 kHz.
+    np.testing.assert_allclose(predicted / peak, y / peak, atol=1e-5)
+    # Slopes have four digits; a step of 0.01 leaves as much of the third derivative.
+    along = np.array([1.0, -0.5, 0.7, 0.3])
+    more, less = (outputs(truth * np.exp(step * along)) for step in (0.01, -0.01))
+    by_elements = np.einsum("e,reh->rh", along, slopes[:, :4])
+    np.testing.assert_allclose(by_elements / peak, (more - less) / 0.02 / peak, atol=1e-4)
+    by_delay = np.eye(2)[:, :, None] * (-2j * np.pi * f / SLOW_RATE * predicted)[:, None]
+    np.testing.assert_allclose(slopes[:, 4:6], by_delay, atol=1e-12)
+    # 5 is 1/σ of a part with half the variance; I_0 has a prior of its own.
+    off = 5 * used * (y - 0.9 * predicted)
+    found = of.scaled(jnp.asarray(0.9 * predicted))
+    np.testing.assert_allclose(found, np.concatenate([off.real, off.imag], axis=1), atol=1e-12)
+    away = np.array([0.0, 0.0, 0.0, np.log(truth[3] / 0.585e-3) / 5, *(delays / 0.5), *filters])
+    np.testing.assert_allclose(of.priors(q), away, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -217,12 +305,12 @@ def test_slow_recovery_is_told_from_other_misfits(truth, snr_db, fits, compiled)
         assert fits or fit.verdict != "successful"
 
 
-def butterworth(f: np.ndarray, corner: float | None) -> np.ndarray:
+def butterworth(f: np.ndarray, corner: float | None, rate: float = SAMPLE_RATE) -> np.ndarray:
     """Response of an anti-alias filter of fourth order; its corner is relative to the rate."""
     if corner is None:
         return np.ones(f.size)
     _, poles, gain = scipy.signal.buttap(4)
-    s = 1j * f / (corner * SAMPLE_RATE)
+    s = 1j * f / (corner * rate)
     return gain / np.prod(s[:, None] - np.asarray(poles), axis=1)
 
 

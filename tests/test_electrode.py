@@ -124,15 +124,15 @@ def electrode(of: Case) -> tuple[Any, ...]:
     result = RESULT[of.fresh]
     fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, result, scores)
     z = np.array([0.1, 0.2])
-    suspected = SUSPICION(of.jump, of.drift, np.array([0.7, 0.8]), 0.02 * BEFORE, 0, z)
-    return state, measured, BEFORE, found, fresh, suspected, LIMIT, NUMBER
+    again = not of.running or of.jump or of.drift
+    suspected = SUSPICION(of.jump, of.drift, again, np.array([0.7, 0.8]), 0.02 * BEFORE, 0, z)
+    return state, measured, BEFORE, fresh if again else found, suspected, LIMIT, NUMBER
 
 
 def expected(of: Case) -> dict[str, Any]:
     """The rules, one electrode at a time."""
-    state, measured, before, found, fresh, suspected, limit, number = electrode(of)
-    again = not of.running or of.jump or of.drift
-    used = fresh if again else found
+    state, measured, before, used, suspected, limit, number = electrode(of)
+    again = suspected.again
     good = of.fresh == "good" if again else of.found
     factor = (used.own - state["own"])[:2]
     # T = δᵀ (Λ⁻¹ + spread)⁻¹ δ, and the element that explains most of it alone.
@@ -235,6 +235,7 @@ def test_a_pulse_is_suspected_by_the_distance_from_its_prediction():
         seen = suspected_of(of, fit, jnp.asarray(before), common, limit)
         assert bool(seen.jump) == jump, (running, good, part)
         assert drift is None or bool(seen.drift) == drift, (running, good, part)
+        assert bool(seen.again) == (not running or jump or bool(seen.drift))
 
 
 class Minimum(NamedTuple):

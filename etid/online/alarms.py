@@ -63,7 +63,6 @@ d = ∂G/∂α √w / σ, and a spread below `SPREAD` does not matter.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import scipy
 from jaxtyping import Array, Bool, Float, Int
@@ -169,7 +168,7 @@ def driver_change(
 
 
 class PulseScores(NamedTuple):
-    """PulseScores of a gain and of a spread of one pulse, and sums of several.
+    """Scores of a gain and of a spread of one pulse, and sums of several.
 
     Attributes:
         sums: s, I and c of each.
@@ -207,14 +206,7 @@ class PulseScores(NamedTuple):
         freedom = 2 * jnp.sum(pulse.weight > 0, dtype=score.dtype) - others.shape[1] - 1
         explained = score**2 / jnp.where(tested, information, 1.0)
         chi2 = (residual @ residual - explained) / freedom
-        # ∂G/∂ log Z_th = −G (1 − G)
-        free = jax.lax.complex(*jnp.split(d, 2, axis=1))
-        towards = free * jnp.conj(gain * weight * (1 - gain))[None, :]
-        of_source = jnp.tensordot(model.source_error.real, towards.real, [[1], [1]])
-        of_source = of_source + jnp.tensordot(model.source_error.imag, towards.imag, [[1], [1]])
-        if model.faults is not None:
-            direct = weight[None, :] * model.by_fault(gain)
-            of_source = of_source - model.faults @ (direct @ jnp.conj(free).T).real
+        of_source = real_parts(model.by_error(gain) * weight[None, :]) @ d.T
         of_x = power(gain) * model.bands.variance_x / variance
         common = jnp.sqrt(jnp.sum(of_source**2, axis=0) + d**2 @ jnp.tile(of_x, 2))
         # More noise than stated lessens the weight of a pulse, as it does in a fit of a record.
@@ -223,17 +215,22 @@ class PulseScores(NamedTuple):
 
     def wrong(self) -> Bool[Array, ""]:
         """Whether sums over pulses show another gain, or a spread, that matters."""
-        score, information, common = self.sums.T
-        scatter = jnp.sqrt(information + common**2)
+        size, stderr = estimate(self.sums)
         allowed = jnp.stack([MOVED / jnp.max(jnp.abs(self.moved)), jnp.asarray(SPREAD)])
-        return jnp.any(jnp.abs(score) - SEEN_IN_PULSES * scatter > allowed * information)
+        return jnp.any(jnp.abs(size) - SEEN_IN_PULSES * stderr > allowed)
+
+
+def estimate(
+    sums: Float[Array, "*change 3"],
+) -> tuple[Float[Array, "*change"], Float[Array, "*change"]]:
+    """Estimate of a change from its sums s, I and c, and its standard error; 0 if I is 0."""
+    score, information, common = jnp.moveaxis(sums, -1, 0)
+    known = jnp.where(information > 0, information, jnp.inf)
+    return score / known, jnp.sqrt(information + common**2) / known
 
 
 def score_of(sums: Float[Array, " 3"], slope: Float[Array, " element"]) -> Score:
     """The score of a change from its sums s, I and c, and the slopes of the elements."""
-    score, information, common = sums
-    scatter, tested = jnp.sqrt(information + common**2), information > 0
-    information = jnp.where(tested, information, 1.0)
-    size = score / information
-    z = jnp.where(tested, score / jnp.where(tested, scatter, 1.0), jnp.nan)
-    return Score(z, size, jnp.abs(size) * jnp.max(jnp.abs(slope)), scatter / information, slope)
+    size, stderr = estimate(sums)
+    moved = jnp.abs(size) * jnp.max(jnp.abs(slope))
+    return Score(size / stderr, size, moved, stderr, slope)

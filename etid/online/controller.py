@@ -56,9 +56,9 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.arguments import number_of, require
-from etid.online.current import Current, CurrentModel
+from etid.online.current import CurrentModel
 from etid.online.state import ElectrodeState, TrackerState
-from etid.online.tracker import Tracker
+from etid.online.tracker import Tracker, for_each
 from etid.precision import in_float64
 from etid.results.verdicts import counts
 from etid.solvers.matrices import inverse_of_few
@@ -66,9 +66,7 @@ from etid.solvers.matrices import inverse_of_few
 REASONS = np.array(
     ["wanted", "peak", "charge", "confirmed", "guard", "voltage", "slew", "fallback"]
 )
-CURRENT_CAP = 5e-3  # [A] the paper's limit for the fingertip
 LARGEST_CAP = 0.1  # [A] stimulators of nerves and skin stay below it
-FALLBACK = 0.1  # unless `charge_cap` allows less
 RAISE = 1.25  # of an amplitude that a pulse has confirmed, to the next pulse
 
 
@@ -110,7 +108,6 @@ class Limits(NamedTuple):
     Attributes:
         current_cap: Largest current of either sign [A].
         charge_cap: Largest charge per phase [C].
-        rest: Charge of a pulse after a pause, at most, relative to that in the steady state.
         quantile: k, in standard errors.
         short: Amplitude without a confirmed estimate; `RAISE` times as much carries `charge_cap`
             through a short circuit.
@@ -122,7 +119,6 @@ class Limits(NamedTuple):
 
     current_cap: Float[Array, ""]
     charge_cap: Float[Array, ""]
-    rest: Float[Array, ""]
     quantile: Float[Array, ""]
     short: Float[Array, ""]
     guard: Float[Array, ""]
@@ -157,7 +153,7 @@ class Controller(Overviewed):
         cls,
         tracker: Tracker,
         *,
-        current_cap: float = CURRENT_CAP,
+        current_cap: float = 5e-3,
         charge_cap: float = math.inf,
         voltage_cap: float = math.inf,
         slew: float = math.inf,
@@ -168,7 +164,8 @@ class Controller(Overviewed):
 
         Args:
             tracker: The tracker.
-            current_cap: Largest current of either sign [A].
+            current_cap: Largest current of either sign [A]; 5 mA is the paper's limit for the
+                fingertip.
             charge_cap: Largest charge per phase [C].
             voltage_cap: Compliance: largest unloaded voltage at the terminal [V].
             slew: Largest increase of the relative amplitude from one pulse to the next. A decrease
@@ -193,7 +190,7 @@ class Controller(Overviewed):
             "charge_cap": charge_cap,
             "voltage_cap": voltage_cap,
             "slew": slew,
-            "fallback": FALLBACK if fallback is None else fallback,
+            "fallback": 0.1 if fallback is None else fallback,
         }
         for name, value in given.items():
             if not number_of(name, value) > 0:
@@ -233,7 +230,6 @@ class Controller(Overviewed):
         limits = Limits(
             current_cap=jnp.asarray(float(current_cap)),
             charge_cap=jnp.asarray(float(charge_cap)),
-            rest=jnp.asarray(model.rest),
             quantile=jnp.asarray(quantile),
             short=jnp.asarray(allowed),
             guard=current_cap / jnp.abs(model.short_circuit()).max(),
@@ -277,14 +273,8 @@ class Controller(Overviewed):
         self.tracker.check(state)
         if (charge is None) == (current is None):
             raise ValueError("give either charge or current")
-        given = np.asarray(charge if current is None else current, float)
-        if given.shape not in ((), (self.tracker.electrodes,)):
-            raise ValueError(
-                f"the wanted numbers have shape {given.shape}; give one, or one for each of "
-                f"{self.tracker.electrodes} electrodes"
-            )
-        if not (np.isfinite(given) & (given >= 0)).all():
-            raise ValueError(f"{given} is wanted; it must be finite and not negative")
+        name, given = ("current", current) if charge is None else ("charge", charge)
+        given = for_each(name, given, self.tracker.electrodes)
         wanted = given if current is None else given * self.model.phase
         if (wanted > self.most).any():
             raise ValueError(
@@ -292,7 +282,6 @@ class Controller(Overviewed):
                 f"{self.most:.3g} C in a phase. Are the numbers in coulomb or ampere, and not in "
                 "nC or mA?"
             )
-        wanted = np.full(self.tracker.electrodes, wanted)
         amplitude, expected, stderr, peak, reason = np.array(
             _commanded(
                 self.tracker.model.circuit,
@@ -316,56 +305,40 @@ def _commanded(
     state: TrackerState,
     wanted: Float[Array | np.ndarray, " lane"],
 ) -> Float[Array, "row lane"]:
-    """The fields of `Command` as rows of one array: each array of a result costs time."""
+    """The fields of `Command` as rows of one array: each array of a result costs time.
+
+    The last row has the numbers of the reasons.
+    """
+    k = limits.quantile
 
     def electrode(lane: ElectrodeState, wanted: Float[Array, ""]) -> Float[Array, " row"]:
         # The inverse of `predicted`, in one step.
         cov = inverse_of_few(lane.information) + change**2 * jnp.eye(lane.information.shape[0])
         now = model.current(circuit, LoadUnknowns.of(lane.own).log_elements, cov)
-        return _electrode(limits, lane, now, wanted, ~state.driver_changed)
+        good = ~state.driver_changed & (lane.result == SUCCESSFUL) & (lane.pulses > 0)
+        good = good & (now.charge > 0) & (now.charge_stderr < now.charge)
+        most = jnp.stack(
+            [
+                wanted / now.charge,
+                limits.current_cap / (now.peak + k * now.peak_stderr),
+                limits.charge_cap / model.rest / (now.charge + k * now.charge_stderr),
+                jnp.maximum(limits.short, jnp.where(lane.amplitude > 0, RAISE * lane.confirmed, 0)),
+                limits.guard,
+                limits.ceiling,
+                jnp.nan_to_num(lane.amplitude) + limits.slew,
+            ]
+        )
+        good = good & ~jnp.isnan(most).any()  # the smallest of some numbers and a NaN is NaN
+        # One bad pulse must not raise the amplitude of wet skin. A new electrode may need more.
+        held = (lane.pulses > 0) & (lane.amplitude > 0)
+        last = jnp.where(held, lane.amplitude, jnp.inf)
+        first = jnp.where(wanted > 0, jnp.minimum(limits.fallback, last), 0.0)
+        safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), limits.short[None], most[4:]])
+        applied = jnp.where(good, most, safe)
+        reason = jnp.argmin(applied)
+        amplitude = applied[reason]
+        expected = amplitude * jnp.stack([now.charge, now.charge_stderr, now.peak])
+        reason = jnp.where(good, reason, len(REASONS) - 1).astype(amplitude.dtype)
+        return jnp.stack([amplitude, *jnp.where(good, expected, jnp.nan), reason])
 
     return jax.vmap(electrode, out_axes=1)(state.electrodes, jnp.asarray(wanted))
-
-
-def _electrode(
-    limits: Limits,
-    state: ElectrodeState,
-    now: Current,
-    wanted: Float[Array, ""],
-    usable: Array,
-) -> Float[Array, " row"]:
-    """The command for one electrode, with the number of its reason.
-
-    Args:
-        limits: The limits.
-        state: State of the electrode.
-        now: Current through it per unit of amplitude.
-        wanted: Wanted charge [C].
-        usable: Whether the driver has not changed.
-    """
-    k = limits.quantile
-    good = usable & (state.result == SUCCESSFUL) & (state.pulses > 0)
-    good = good & (now.charge > 0) & (now.charge_stderr < now.charge)
-    most = jnp.stack(
-        [
-            wanted / now.charge,
-            limits.current_cap / (now.peak + k * now.peak_stderr),
-            limits.charge_cap / limits.rest / (now.charge + k * now.charge_stderr),
-            jnp.maximum(limits.short, jnp.where(state.amplitude > 0, RAISE * state.confirmed, 0)),
-            limits.guard,
-            limits.ceiling,
-            jnp.nan_to_num(state.amplitude) + limits.slew,
-        ]
-    )
-    good = good & ~jnp.isnan(most).any()  # the smallest of some numbers and a NaN is NaN
-    # One bad pulse must not raise the amplitude of wet skin. A new electrode may need more.
-    held = (state.pulses > 0) & (state.amplitude > 0)
-    last = jnp.where(held, state.amplitude, jnp.inf)
-    first = jnp.where(wanted > 0, jnp.minimum(limits.fallback, last), 0.0)
-    safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), limits.short[None], most[4:]])
-    applied = jnp.where(good, most, safe)
-    reason = jnp.argmin(applied)
-    amplitude = applied[reason]
-    expected = amplitude * jnp.stack([now.charge, now.charge_stderr, now.peak])
-    reason = jnp.where(good, reason, len(REASONS) - 1).astype(amplitude.dtype)
-    return jnp.concatenate([amplitude[None], jnp.where(good, expected, jnp.nan), reason[None]])

@@ -30,9 +30,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.online.pulse_fit import GainModel, first_largest
 from etid.signals.transfer import frequency_variable, reciprocal
 
-EDGE = 24  # [samples] after each edge that are looked at in steps of `FINE`
-FINE = 0.5  # [samples]
-COARSE = 8.0  # [samples] between the other times of the pulse
+EDGE = 24  # [samples] after each edge that are looked at in steps of half a sample
 
 
 class Current(eqx.Module):
@@ -82,20 +80,22 @@ class CurrentModel(eqx.Module):
         v = bands.waveform()
         polarity = np.sign(v[np.argmax(np.abs(v))])
         begin, end = _phase(polarity * v)
-        edges = [np.arange(-2.0, EDGE, FINE) + edge for edge in (begin, end)]
-        times = np.concatenate([edges[0], np.arange(begin + EDGE, end - 2, COARSE), edges[1]])
+        edges = [np.arange(-2.0, EDGE, 0.5) + edge for edge in (begin, end)]
+        times = np.concatenate([edges[0], np.arange(begin + EDGE, end - 2, 8.0), edges[1]])
         omega = 2 * np.pi * number / bands.samples  # per sample
         integral = (np.exp(1j * omega * end) - np.exp(1j * omega * begin)) / (1j * omega * rate)
         integral *= polarity
         rows = np.concatenate([integral[None, :], np.exp(1j * np.outer(times, omega))])
         rows = 2 / bands.samples * rows * x
-        by_band = rows @ _interpolation(number, np.asarray(bands.frequency) * bands.samples / rate)
+        # Linear interpolation from the centres of bands to bins; constant at the ends.
+        centres = np.asarray(bands.frequency) * bands.samples / rate
+        weights = [np.interp(number, centres, one) for one in np.eye(centres.size)]
         return cls(
             frequency=bands.frequency,
             source=pulses.source,
             source_error=pulses.source_error,
             faults=pulses.faults,
-            sums=jnp.asarray(by_band),
+            sums=jnp.asarray(rows @ np.stack(weights, axis=1)),
             phase=float((end - begin) / rate),
             rest=float(bands.samples / (bands.samples - (end - begin))),
         )
@@ -164,10 +164,3 @@ def _phase(v: Float[np.ndarray, " sample"]) -> tuple[float, float]:
     before, after = below[below < top].max(), below[below > top].min()
     begin = before + v[before] / (v[before] - v[before + 1])
     return begin, after - v[after] / (v[after] - v[after - 1])
-
-
-def _interpolation(
-    bins: Float[np.ndarray, " bin"], centres: Float[np.ndarray, " band"]
-) -> Float[np.ndarray, "bin band"]:
-    """Weights of linear interpolation from the centres of bands to bins; constant at the ends."""
-    return np.stack([np.interp(bins, centres, one) for one in np.eye(centres.size)], axis=1)

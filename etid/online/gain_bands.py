@@ -44,11 +44,8 @@ from etid.signals.transfer import as_complex, power
 RELATIVE = 4  # frequency of a band over its width
 WIDEST = 64  # [bins] largest width of a band
 LAST_BAND = 8  # [bins] width of the last band, which has no neighbour to show its curvature
-PRESENT = 0.5  # minimum fraction of a band's power in X that must be signal
 TAIL_SPREAD = 0.2  # of the rate of the tail, by the load, relative to that of the unloaded record
-TAIL_ERROR = 0.2  # of the tail that an amplitude lacks after it has changed
 LAST = 1 / 26  # fraction of a period at its end whose mean is the tail
-DIVERSE = 0.9  # |mean e^(−j2πφ)| above which the sampling phases are too similar
 
 
 def cut(
@@ -154,7 +151,7 @@ class Bands(eqx.Module):
         """
         gain = seen.gain()
         tail = self._lacking_tail(seen, lacking, offset)
-        unsure = self.weight[None, :] * power(TAIL_ERROR * tail) / 2
+        unsure = self.weight[None, :] * power(0.2 * tail) / 2  # a fifth of the tail
         weight = self.weight[None, :] / (seen.variance[:, None] + unsure)
         return gain + tail, weight
 
@@ -237,7 +234,7 @@ def unloaded_bands(
     y = np.fft.rfft(windows)[:, 1 : bins + 1] * turned
     # Unknowns: X(f) and, if the phases differ enough, X(f − fs).
     design = np.exp(-2j * np.pi * np.outer(phase, [0, 1]))
-    if abs(design[:, 1].mean()) > DIVERSE:
+    if abs(design[:, 1].mean()) > 0.9:
         design = design[:, :1]
     found = np.linalg.pinv(design) @ y
     share = np.linalg.inv(design.conj().T @ design)[0, 0].real
@@ -255,7 +252,7 @@ def unloaded_bands(
     angle = 2 * np.pi * centre / size
     width = summed(np.abs(x) ** 2 * (number - np.repeat(centre, wide)) ** 2)
     signal = strength - wide * variance
-    present = signal > PRESENT * strength
+    present = signal > 0.5 * strength  # a band whose X is mostly noise has no weight
     divisor = np.where(present, signal, strength)
 
     mean = windows.mean(axis=0)

@@ -22,18 +22,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.signals.harmonics import ALIASED
 
-BLOCKS = 208  # blocks in a period, if there were no pulse
-SHORTEST = 8  # [samples] smallest length of a block
-EDGE = 1e-2  # second difference over a block that is an edge, relative to the largest one
-CLEAR = 12.0  # the same relative to the noise of the unloaded pulse
-LEAD, FOLLOW = 4, 8  # blocks before the first edge and after the last that are kept as samples
-NOISE_FREQUENCIES = 6  # at which the noise of a block is measured
-QUIET = 40  # smallest number of blocks times frequencies
-RESOLUTION = 1e-6  # relative, larger than that of single precision
 TOGETHER = 50  # electrodes whose samples fit in the cache of a core and are read only once
-# Multiplications of a matrix product from which OpenBLAS starts threads. If other programs keep the
-# cores busy, these threads wait for each other for tens of milliseconds.
-THREADED = 1 << 18
 
 
 class Seen(NamedTuple):
@@ -120,16 +109,17 @@ class Projection:
         Raises:
             ValueError: The quiet between two pulses is too short.
         """
-        block = max(x.size // BLOCKS, SHORTEST)
+        block = max(x.size // 208, 8)  # 208 blocks in a period, if there were no pulse
         pieces, runs = _partition(x, sigma, block)
         columns = [rows[:, begin:end] for begin, end in pieces]
         for begin, count in runs:
             columns.append(rows[:, begin : begin + block * count] @ _smooth(count, block))
         within = _within(block)
-        if sum(count for _, count in runs) * (within.shape[1] - 1) < QUIET:
-            raise ValueError("the quiet between two pulses is too short for its noise to be known")
         kept = np.ascontiguousarray(np.concatenate(columns, axis=1).T)
-        return cls(x.size, tuple(pieces), tuple(runs), block, within, kept, floor)
+        found = cls(x.size, tuple(pieces), tuple(runs), block, within, kept, floor)
+        if found.freedom() < 40:
+            raise ValueError("the quiet between two pulses is too short for its noise to be known")
+        return found
 
     def shares(self) -> Float[np.ndarray, " kept"]:
         """Variance of each sample and mean, relative to that of a sample."""
@@ -157,7 +147,8 @@ class Projection:
         """
         found, squares, clipped = [], [], []
         low, high = adc_range
-        margin = RESOLUTION * np.abs(adc_range[np.isfinite(adc_range)]).max(initial=0.0)
+        # More than single precision resolves.
+        margin = 1e-6 * np.abs(adc_range[np.isfinite(adc_range)]).max(initial=0.0)
         with np.errstate(invalid="ignore", over="ignore"):  # samples that are not numbers
             for first in range(0, len(v_out), TOGETHER):
                 samples = v_out[first : first + TOGETHER].astype(self.rows.dtype)
@@ -196,8 +187,12 @@ class Projection:
 def _product(
     kept: Float[np.ndarray, "lane kept"], rows: Float[np.ndarray, "kept row"]
 ) -> Float[np.ndarray, "lane row"]:
-    """`kept @ rows`, in parts for which BLAS starts no threads."""
-    step = max(THREADED // (len(kept) * rows.shape[1]), 1)
+    """`kept @ rows`, in parts for which BLAS starts no threads.
+
+    OpenBLAS starts them from 2¹⁸ multiplications on. If other programs keep the cores busy, these
+    threads wait for each other for tens of milliseconds.
+    """
+    step = max(2**18 // (len(kept) * rows.shape[1]), 1)
     found = kept[:, :step] @ rows[:step]
     for first in range(step, len(rows), step):
         of = slice(first, first + step)
@@ -220,8 +215,8 @@ def _partition(
     """
     half = block // 2
     bend = np.abs(np.roll(x, half) - 2 * x + np.roll(x, -half))
-    sharp = np.flatnonzero(bend > max(EDGE * bend.max(), CLEAR * sigma))
-    near = np.arange(-LEAD * block, FOLLOW * block + 1)
+    sharp = np.flatnonzero(bend > max(1e-2 * bend.max(), 12 * sigma))
+    near = np.arange(-4 * block, 8 * block + 1)  # samples around an edge are kept
     kept = np.zeros(x.size, bool)
     kept[(sharp[:, None] + near) % x.size] = True
     pieces, runs = [], []
@@ -249,7 +244,7 @@ def _within(block: int) -> Float[np.ndarray, "sample column"]:
     """The mean of a block, and unit vectors at right angles to a parabola at some frequencies."""
     at = (np.arange(block) + 0.5) / block
     highest = round(2 * ALIASED * block)  # half periods in a block
-    waves = np.unique(np.linspace(4, highest, NOISE_FREQUENCIES).round())
+    waves = np.unique(np.linspace(4, highest, 6).round())
     smooth = np.stack([at**0, at, at**2], axis=1)
     basis, _ = np.linalg.qr(np.concatenate([smooth, np.cos(np.pi * np.outer(at, waves))], axis=1))
     return np.concatenate([np.full((block, 1), 1 / block), basis[:, 3:]], axis=1)

@@ -8,6 +8,7 @@ error of the order of ε², and the second one of ε³.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,8 +29,6 @@ from etid.solvers.matrices import inverse_of_few, root
 
 STEP = 0.1  # [samples] spacing of the grid of delays
 DELAYS = STEP * np.arange(-15, 16)  # [samples] up to 1 by the trigger and 0.5 by the window
-# Damping of the first step of a search, and its factors after a good and after a bad step.
-DAMPING, LOWER, RAISE = 1e-2, 0.1, 8.0
 SEARCH = 40  # largest number of steps of a search
 SETTLED = 1.0  # distance to the minimum before the last step [standard errors of one pulse]
 
@@ -104,17 +103,16 @@ class GainModel(eqx.Module):
         faults = None if known.faults is None else independent @ known.faults[1]
         return cls(circuit, bands, source, source_alias, turn, turns, freedom, error, faults)
 
-    def by_fault(self, gain: Complex[Array, " band"]) -> Complex[Array, "3 band"]:
-        """Changes of a gain by gain, crosstalk and capacitance of the instrument."""
-        # ∂G/∂C = −s Z_L² ∂G/∂Z_L
-        by_capacitance = -frequency_variable(self.bands.frequency) * self.source * gain**2
-        return jnp.stack([gain, jnp.ones_like(gain), by_capacitance])
-
     def by_error(self, gain: Complex[Array, " band"]) -> Complex[Array, "z band"]:
         """Changes of a gain by each independent error of calibrations and instrument."""
         # ∂G/∂ log Z_th = −G (1 − G)
         found = (gain * (gain - 1))[None, :] * self.source_error
-        return found if self.faults is None else found + combined(self.faults, self.by_fault(gain))
+        if self.faults is None:
+            return found
+        # ∂G/∂C = −s Z_L² ∂G/∂Z_L
+        by_capacitance = -frequency_variable(self.bands.frequency) * self.source * gain**2
+        by_fault = jnp.stack([gain, jnp.ones_like(gain), by_capacitance])
+        return found + combined(self.faults, by_fault)
 
     def expected(self, logs: Float[Array, " element"]) -> "Expected":
         """The gain of a load, and its derivatives."""
@@ -221,15 +219,15 @@ def minimum(
     """
     own = start.vector()
     jacobian = pulse.jacobian(expected)
-    before = pulse.equations(start, jacobian, expected.gain)
     first = pulse.residual(expected.gain, start.delay_samples)
+    before = pulse.equations(start, jacobian, first)
     inverse = inverse_of_few(before.matrix)
     trial = own - inverse @ before.gradient
     reached = LoadUnknowns.of(trial)
     residual = pulse.residual(pulse.model.undelayed(reached.log_elements), reached.delay_samples)
-    pull = pulse.pull(reached)
+    pull, distance = pulse.prior(reached)
     squares = jnp.dot(residual, residual)
-    objective = squares + jnp.dot(pull, pulse.off(reached))
+    objective = squares + distance
     better = objective <= before.objective
     own = jnp.where(better, trial, own)
     at = before._replace(
@@ -272,14 +270,12 @@ def searched(
         )
         after = equations(trial)
         better = after.objective <= carry.at.objective
-        own, at = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old), (trial, after), (carry.own, carry.at)
-        )
-        damping = carry.damping * jnp.where(better, LOWER, RAISE)
+        own, at = jax.tree.map(partial(jnp.where, better), (trial, after), (carry.own, carry.at))
+        damping = carry.damping * jnp.where(better, 0.1, 8.0)
         return _Search(own, at, damping, carry.steps + 1, far(at))
 
     at = equations(start)
-    first = _Search(start, at, jnp.asarray(DAMPING), jnp.zeros((), int), wanted & far(at))
+    first = _Search(start, at, jnp.asarray(1e-2), jnp.zeros((), int), wanted & far(at))
     return jax.lax.while_loop(going, stepped, first).own
 
 
@@ -316,35 +312,31 @@ class Pulse(eqx.Module):
         weight = as_complex(jnp.sqrt(self.weight))
         return real_parts((self.gain * self.model.turned(delay) - expected) * weight)
 
-    def off(self, own: LoadUnknowns) -> Float[Array, " own"]:
-        """Distance from what is known before the pulse."""
-        return LoadUnknowns(own.log_elements - self.centre, own.delay_samples).vector()
-
-    def pull(self, own: LoadUnknowns) -> Float[Array, " own"]:
-        """Half the gradient of what is known before the pulse."""
-        at = self.information @ (own.log_elements - self.centre)
-        return LoadUnknowns(at, own.delay_samples / DELAY_WIDTH**2).vector()
+    def prior(self, own: LoadUnknowns) -> tuple[Float[Array, " own"], Float[Array, ""]]:
+        """Squared distance from what is known before the pulse: half its gradient, and itself."""
+        off, late = own.log_elements - self.centre, own.delay_samples
+        pull = LoadUnknowns(self.information @ off, late / DELAY_WIDTH**2).vector()
+        return pull, jnp.dot(pull, LoadUnknowns(off, late).vector())
 
     def equations(
         self,
         own: LoadUnknowns,
         jacobian: Float[Array, "own part"],
-        expected: Complex[Array, " band"],
+        residual: Float[Array, " part"],
     ) -> Equations:
         """Normal equations of the pulse and of the prior.
 
         Args:
             own: Where they are wanted.
             jacobian: Derivatives of the residual there.
-            expected: Gain there.
+            residual: Residual there.
         """
-        residual = self.residual(expected, own.delay_samples)
-        pull, squares = self.pull(own), jnp.dot(residual, residual)
+        (pull, distance), squares = self.prior(own), jnp.dot(residual, residual)
         curvature = jacobian @ jacobian.T
         # A stated delay is no help: a window begins up to half a sample beside its pulse.
         prior = jnp.pad(self.information, (0, 1)).at[-1, -1].set(1 / DELAY_WIDTH**2)
         return Equations(
-            squares + jnp.dot(pull, self.off(own)),
+            squares + distance,
             squares,
             jacobian @ residual + pull,
             curvature,

@@ -18,7 +18,6 @@ from etid.recordings.errors import RecordingError
 from etid.recordings.untrusted import guarded
 
 BLOCK = 500  # samples of a block that is played back
-GAP = 60  # lost pulses in a row that are given to the tracker one by one
 LARGEST = 10**8  # voltages in a block; a header that says more is out of step
 Block = tuple[int, np.ndarray]
 
@@ -161,7 +160,7 @@ class Pulses:
                 self.late += 1
                 continue
             lost = int(first / self.period) - self.number - 1
-            if lost > GAP:  # a long pause
+            if lost > 60:  # a long pause, whose pulses the tracker does not get one by one
                 self.missing += lost
                 self.number += lost
                 self.window = np.full_like(self.window, np.nan)

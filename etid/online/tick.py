@@ -34,8 +34,6 @@ from etid.signals.transfer import as_complex, power
 from etid.solvers.matrices import inverse_of_few, root_of_few
 
 STEADY = 0.1  # relative change of amplitude up to which the mean of a window is its offset
-FLAT = 4.0  # power relative to that of noise alone; below this, the pulse is `flat`
-NOISY = 5.2  # standard deviations of a pulse's χ² that noise exceeds once in 10⁷ pulses
 PATIENCE = 5  # pulses in a row that do not fit, after which an electrode starts again
 
 
@@ -75,7 +73,7 @@ class Attempt(NamedTuple):
         chi2: χ² of the pulse.
         rrse: RRSE of the pulse.
         result: Verdict.
-        scores: PulseScores of a gain and of a spread.
+        scores: Scores of a gain and of a spread.
     """
 
     own: Float[Array, "*lane own"]
@@ -93,6 +91,7 @@ class Suspicion(NamedTuple):
     Attributes:
         jump: Whether the pulse does not fit its prediction.
         drift: Whether the moving mean of the innovations is not zero.
+        again: Whether the electrode is identified from this pulse alone.
         mean: Moving mean of the innovations.
         mean_cov: Its covariance.
         element: The element that explains the drift best.
@@ -101,6 +100,7 @@ class Suspicion(NamedTuple):
 
     jump: Bool[Array, "*lane"]
     drift: Bool[Array, "*lane"]
+    again: Bool[Array, "*lane"]
     mean: Float[Array, "*lane element"]
     mean_cov: Float[Array, "*lane element element"]
     element: Int[Array, "*lane"]
@@ -132,10 +132,20 @@ def updated(
     information = jax.vmap(lambda of: predicted(of, change))(before.information)
     logs = LoadUnknowns.of(before.own).log_elements
     expected = _expected(model, logs, number)
-    found = jax.vmap(lambda *of: _tracked(model, *of))(before, measured, expected, information)
+
+    def tracked(
+        logs: Float[Array, " element"],
+        measured: Measured,
+        expected: Expected,
+        information: Float[Array, "element element"],
+    ) -> Attempt:
+        delay, _ = nearest_delay(model, measured.gain, expected.gain)
+        return attempt(model, measured, LoadUnknowns(logs, delay), expected, logs, information)
+
+    found = jax.vmap(tracked)(logs, measured, expected, information)
     suspected = jax.vmap(partial(suspicion, common=powers, limit=limit))(before, found, information)
     running = before.pulses > 0
-    wanted = (~running | suspected.jump | suspected.drift) & (measured.bad == SUCCESSFUL)
+    wanted = suspected.again & (measured.bad == SUCCESSFUL)
     starts = circuit_starts(model.circuit, None)
     fresh = jax.lax.cond(
         wanted.any(),
@@ -145,8 +155,11 @@ def updated(
         wanted,
         logs,
     )
+    used = jax.vmap(lambda again, *of: jax.tree.map(partial(jnp.where, again), *of))(
+        suspected.again, fresh, found
+    )
     after = jax.vmap(partial(after_pulse, limit=limit, number=number))(
-        before, measured, information, found, fresh, suspected
+        before, measured, information, used, suspected
     )
     counts = running & measured.steady & (measured.bad == SUCCESSFUL)
     event = driver_change(suspected.jump, suspected.z.T, counts, running)
@@ -188,7 +201,7 @@ def measured_pulse(
     variance = jnp.asarray(seen.variance)
     signal = power(gain) @ bands.weight
     noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * variance
-    flat = (signal < FLAT * noise) | ~(amplitude > 0)
+    flat = (signal < 4 * noise) | ~(amplitude > 0)
     level = jnp.sqrt(jnp.maximum(signal - noise, 0.0) / jnp.sum(bands.weight)) / relative
     shown = power(seen.gain()) @ bands.weight  # of the samples alone
     repeated = jnp.any(shown[:, None] == before.shown, axis=1)
@@ -239,9 +252,10 @@ def attempt(
     weight = model.bands.weight
     freedom = 2 * jnp.sum(weight > 0, dtype=at.squares.dtype) - own.size
     chi2 = at.squares / freedom
-    # The cube root of χ² is nearly normal (Wilson and Hilferty 1931).
+    # The cube root of χ² is nearly normal (Wilson and Hilferty 1931). Noise exceeds 5.2 standard
+    # deviations once in 10⁷ pulses.
     width = 2 / 9 * (1 / freedom + 1 / model.noise_freedom)
-    noisy = chi2 < (1 - width + NOISY * jnp.sqrt(width)) ** 3
+    noisy = chi2 < (1 - width + 5.2 * jnp.sqrt(width)) ** 3
     rrse = jnp.sqrt(at.squares * measured.variance / jnp.sum(weight * power(gain)))
     by_delay = at.curvature[:-1, -1]
     told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
@@ -255,19 +269,6 @@ def attempt(
         (misses(chi2, rrse) & ~noisy | late, RESULTS.misfit),
     )
     return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, scores)
-
-
-def _tracked(
-    model: GainModel,
-    state: ElectrodeState,
-    measured: Measured,
-    expected: Expected,
-    information: Float[Array, "element element"],
-) -> Attempt:
-    """The fit of a pulse, with the prediction from the pulses before it."""
-    logs = LoadUnknowns.of(state.own).log_elements
-    delay, _ = nearest_delay(model, measured.gain, expected.gain)
-    return attempt(model, measured, LoadUnknowns(logs, delay), expected, logs, information)
 
 
 def anew(
@@ -301,7 +302,8 @@ def anew(
         expected = model.expected(own.log_elements)
         gain = measured.gain - model.departure(expected, own.delay_samples)
         pulse = Pulse(model, gain, measured.weight, start, nothing)
-        return pulse.equations(own, pulse.jacobian(expected), expected.gain)
+        residual = pulse.residual(expected.gain, own.delay_samples)
+        return pulse.equations(own, pulse.jacobian(expected), residual)
 
     own = LoadUnknowns.of(searched(equations, LoadUnknowns(start, delay).vector(), wanted))
     expected = model.expected(own.log_elements)
@@ -343,9 +345,12 @@ def suspicion(
     new = Innovation.of(off + found.spread @ information @ off, found.spread, information)
     moving = averaged(state.mean, state.mean_cov, new)
     running, fits = state.pulses > 0, found.result == SUCCESSFUL
+    jump = running & ~(fits & (new.statistic() <= limit))
+    drift = running & fits & (moving.statistic() > limit)
     return Suspicion(
-        running & ~(fits & (new.statistic() <= limit)),
-        running & fits & (moving.statistic() > limit),
+        jump,
+        drift,
+        ~running | jump | drift,
         moving.d,
         moving.cov,
         moving.element(),
@@ -357,28 +362,24 @@ def after_pulse(
     state: ElectrodeState,
     measured: Measured,
     information: Float[Array, "element element"],
-    found: Attempt,
-    fresh: Attempt,
+    used: Attempt,
     suspected: Suspicion,
     limit: Float[Array, ""],
     number: Int[Array, ""],
 ) -> ElectrodeState:
     """State of one electrode after one pulse."""
-    running = state.pulses > 0
-    again = ~running | suspected.jump | suspected.drift
-    used: Attempt = jax.tree.map(lambda new, old: jnp.where(again, new, old), fresh, found)
-    good = used.result == SUCCESSFUL
+    running, good = state.pulses > 0, used.result == SUCCESSFUL
     factor = LoadUnknowns.of(used.own).log_elements - LoadUnknowns.of(state.own).log_elements
     moved = Innovation.of(factor, used.spread, information)
-    jumped = running & suspected.jump & good & (moved.statistic() > limit)
-    drifted = running & suspected.drift & good & ~jumped
+    jumped = suspected.jump & good & (moved.statistic() > limit)
+    drifted = suspected.drift & good & ~jumped
     event = jnp.where(jumped, JUMP, jnp.where(drifted, DRIFT, NONE)).astype(int)
     changed = jumped | drifted
 
     silent = measured.amplitude == 0
     missed = jnp.where(good, 0, state.missed + jnp.where(silent, 0, 1))
     lost = running & ((missed >= PATIENCE) | (measured.bad == RESULTS.unconnected))
-    restarted = good & again
+    restarted = good & suspected.again
     one = jnp.where(restarted, 1, state.pulses + 1)
     sums = used.scores.sums + jnp.where(restarted, 0.0, state.scores)
     sums = jnp.where(good, sums, state.scores)
@@ -389,7 +390,7 @@ def after_pulse(
     shape = used.information / jnp.sum(measured.weight)
     summed = turned(information, state.shape, shape) + used.information
     gained = jnp.where(restarted, used.information, summed)
-    followed = good & ~again
+    followed, ended = good & ~suspected.again, good | lost
     return ElectrodeState(
         own=jnp.where(good | begun, used.own, state.own),
         information=jnp.where(lost, 0.0, jnp.where(good, gained, information)),
@@ -408,10 +409,8 @@ def after_pulse(
         result=RESULTS.where(
             silent, state.result, RESULTS.where(wrong, RESULTS.misfit, used.result)
         ),
-        mean=jnp.where(followed, suspected.mean, jnp.where(good | lost, 0.0, state.mean)),
-        mean_cov=jnp.where(
-            followed, suspected.mean_cov, jnp.where(good | lost, 0.0, state.mean_cov)
-        ),
+        mean=jnp.where(followed, suspected.mean, jnp.where(ended, 0.0, state.mean)),
+        mean_cov=jnp.where(followed, suspected.mean_cov, jnp.where(ended, 0.0, state.mean_cov)),
         event=event,
         factor=jnp.where(changed, factor, state.factor),
         element=jnp.where(

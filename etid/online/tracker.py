@@ -40,6 +40,7 @@ of one or two per cent in C_p.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -309,15 +310,7 @@ class Tracker(Overviewed):
                 field="v_out",
                 remedy="Multiply converter codes by volts per code; convert voltages to floats",
             )
-        amplitude = np.asarray(amplitude, float)
-        if amplitude.shape not in ((), (self.electrodes,)):
-            raise ValueError(
-                f"amplitude has shape {amplitude.shape}; give one number, or one for each of "
-                f"{self.electrodes} electrodes"
-            )
-        if not (np.isfinite(amplitude) & (amplitude >= 0)).all():
-            raise ValueError(f"amplitude is {amplitude}; it must be finite and not negative")
-        relative = np.full(self.electrodes, amplitude)
+        relative = for_each("amplitude", amplitude, self.electrodes)
         found = self.projection.seen(v_out.astype(float, copy=False), self.adc_range)
         return updated(self.model, self.change, self.limit, state, found, relative)
 
@@ -372,6 +365,23 @@ class Tracker(Overviewed):
             state: State of the tracker.
         """
         return bad_electrodes(state, np.abs(np.asarray(_lowest(self.model, state.electrodes.own))))
+
+
+def for_each(name: str, given: Any, electrodes: int) -> Float[np.ndarray, " lane"]:
+    """A number for each electrode, from one for all or one for each.
+
+    Raises:
+        ValueError: A number is negative or not finite, or there is not one for each electrode.
+    """
+    found = np.asarray(given, float)
+    if found.shape not in ((), (electrodes,)):
+        raise ValueError(
+            f"{name} has shape {found.shape}; give one number, or one for each of {electrodes} "
+            "electrodes"
+        )
+    if not (np.isfinite(found) & (found >= 0)).all():
+        raise ValueError(f"{name} is {found}; it must be finite and not negative")
+    return np.full(electrodes, found)
 
 
 @program

@@ -12,7 +12,6 @@ from etid.selection.evidence import best, bic, elements, rank
 from etid.selection.selection import Selection
 
 LIMIT = 20.0  # largest loss of 2 log evidence by one recording; "very strong" begins at 10
-DESERVED = 10.0  # 2 log evidence from which on a recording deserves a circuit of its own
 
 
 def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) -> int:
@@ -61,6 +60,6 @@ def deserves(selection: Selection, chosen: int) -> str:
     own = best(selection.fits, criterion)
     gained = criterion[chosen] - criterion[own]
     name = type(selection.fits[own].circuit).__name__
-    if own == chosen or rank(selection.fits[own]) or gained < DESERVED:
+    if own == chosen or rank(selection.fits[own]) or gained < 10:  # less than "very strong"
         return ""
     return f"The recording supports {name} better: 2 log evidence +{gained:.0f}."

@@ -18,10 +18,6 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-CHANCE = 1e-4  # part of the studies whose limit is too small
-STEPS = 40  # halvings of the logarithm of the width
-RANGE = 1e-6  # smallest width, relative to the largest one
-
 
 def upper_limit(
     delays: Float[np.ndarray, " load"],
@@ -41,7 +37,7 @@ def upper_limit(
     """
     values, vectors = np.linalg.eigh(cov)
     shared = slope @ vectors * np.sqrt(np.maximum(values, 0.0))
-    least = scipy.special.chdtri(delays.size, 1 - CHANCE)
+    least = scipy.special.chdtri(delays.size, 1 - 1e-4)
 
     def explained(width: float) -> bool:
         """Whether S(width) is as small as it is by chance; V is diagonal and of low rank."""
@@ -51,10 +47,10 @@ def upper_limit(
         squares = weight @ delays**2 - of_shared @ np.linalg.solve(inner, of_shared)
         return bool(squares <= least)
 
-    low, high = largest * RANGE, largest
+    low, high = 1e-6 * largest, largest
     if not explained(high):
         return largest
-    for _ in range(STEPS):
+    for _ in range(40):
         middle = math.sqrt(low * high)
         low, high = (low, middle) if explained(middle) else (middle, high)
     return high

@@ -19,8 +19,6 @@ import numpy as np
 
 from etid.results.driver import LARGEST, LEAST, OrderEvidence
 
-PER_POLE = 2  # unknowns of one more pole: its rate and its gain
-
 
 @dataclasses.dataclass(frozen=True)
 class TriedOrder:
@@ -51,7 +49,7 @@ class TriedOrder:
     @property
     def asks_for_more(self) -> bool:
         """Whether one more section would lower Σ r² by more than a pole costs."""
-        return not self.missing_pole <= PER_POLE * math.log(self.terms)
+        return not self.missing_pole <= 2 * math.log(self.terms)
 
 
 def best(tried: Sequence[TriedOrder]) -> TriedOrder:

@@ -32,8 +32,6 @@ _UNDETERMINED = ("insensitive", "resolution", "driver_failed")
 # Difference of BIC that is "not worth more than a bare mention" (Kass and Raftery 1995, section
 # 3.2): of circuits that are so close, the simplest is chosen.
 MENTION = 2.0
-# An exponent nearer to 1 is a capacitor: a driver of too low an order can imitate 0.006.
-NEARLY_ONE = 0.01
 
 
 def rank(fit: Fit) -> int:
@@ -45,7 +43,8 @@ def rank(fit: Fit) -> int:
     """
     name = fit.verdict
     if name in _ADEQUATE:
-        return int(any(float(alpha) > 1 - NEARLY_ONE for alpha in fit.circuit.exponents()))
+        # A driver of too low an order can imitate an exponent of 0.994.
+        return int(any(float(alpha) > 0.99 for alpha in fit.circuit.exponents()))
     return 1 if name in _UNDETERMINED else 2
 
 

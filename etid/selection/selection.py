@@ -17,7 +17,6 @@ from etid.selection.search import PATIENCE, asked
 from etid.selection.unseen import hidden, unseen
 
 HEADS = ("circuit", "2 log evidence", "weight", "chi2", "verdict", "elements")
-CLOSE = 0.02  # weight of another circuit from which on a remark is made
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -143,5 +142,5 @@ def _concluded(fits: Mapping[int, Fit], chosen: int) -> Fit:
     fit, share = fits[chosen], weights(fits) | hidden(fits, chosen)
     cov = with_close(fits, chosen, share) + unseen(fit)
     others = sum(probable for number, probable in share.items() if number != chosen)
-    close = Remark.circuits_close if others > CLOSE else 0
+    close = Remark.circuits_close if others > 0.02 else 0
     return dataclasses.replace(fit, cov=cov, remarks=np.asarray(int(fit.remarks) | close))

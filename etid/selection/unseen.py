@@ -36,8 +36,6 @@ from etid.selection.evidence import elements, values_of
 # τ; 1 − α is 0.2 for dry skin (Gabriel, Lau and Gabriel 1996, see `SkinCole`), and the share of R_s
 # is 0.15 for the dry and 0.26 for the damp skin of the paper.
 WIDTH = 0.2
-SERIES = "r_s"
-LARGEST = 50.0  # exponent of an evidence; more is as certain
 
 
 def unseen(fit: Fit) -> Float[np.ndarray, "element element"]:
@@ -58,13 +56,13 @@ def hidden(fits: Mapping[int, Fit], chosen: int) -> dict[int, float]:
     """Probability of the candidate that is the chosen circuit and R_s; empty if there is none."""
     own = dict(zip(fits[chosen].circuit.names(), values_of(fits[chosen]), strict=True))
     found = {}
-    if "r_p" not in own or SERIES in own:
+    if "r_p" not in own or "r_s" in own:
         return found
     for number, fit in fits.items():
         names = fit.circuit.names()
-        if set(names) != {*own, SERIES}:
+        if set(names) != {*own, "r_s"}:
             continue
-        at = names.index(SERIES)
+        at = names.index("r_s")
         sigma = math.sqrt(max(float(np.asarray(fit.cov)[at, at]), 0.0)) / own["r_p"]
         if sigma > 0:
             evidence, _ = posterior(-float(values_of(fit)[at]) / own["r_p"], sigma)
@@ -80,6 +78,7 @@ def posterior(estimate: float, sigma: float) -> tuple[float, float]:
     below = 0.5 * math.erfc(-u / math.sqrt(2))
     if below < 1e-9:  # far above a capacitor
         return 0.0, 0.0
-    evidence = 2 * deviation / WIDTH * math.exp(min(u**2 / 2, LARGEST)) * below
+    # An evidence of more than e⁵⁰ is as certain.
+    evidence = 2 * deviation / WIDTH * math.exp(min(u**2 / 2, 50.0)) * below
     density = math.exp(-(u**2) / 2) / math.sqrt(2 * math.pi)
     return evidence, mean**2 + variance - mean * deviation * density / below

@@ -9,7 +9,6 @@ in all of them. A linear fit of such a record would not do: it ends anywhere.
 """
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -29,12 +28,6 @@ from etid.signals.transfer import as_complex, power
 from etid.solvers.harmonic_balance import to_time
 from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
-
-# Of the other elements, relative to those of the likeliest linear load, which are far too large.
-LEVELS = (1.0, 0.1)
-TIMES = (1.0, 0.1, 0.01, 0.001)
-REACH = 100.0  # I_0 of the lines, relative to the smallest and the largest current
-LINES = 200
 
 
 def _equations(_, q: Float[Array, " q"], of: Amplitudes) -> NormalEquations:
@@ -122,7 +115,9 @@ def _starts(of: Amplitudes, alone: Float[Array, "record own"]) -> Float[Array, "
     if current_dependent(of.circuit.impedance()) is not None:
         size = jnp.sum(power(of.spectra.x), axis=-1)
         ends = logs[jnp.stack([jnp.argmin(size), jnp.argmax(size)])]
-        scales = jnp.log(jnp.asarray(list(itertools.product(LEVELS, TIMES))))
+        # Of the other elements: those of the likeliest linear load are far too large.
+        levels, times = jnp.array([1.0, 0.1]), jnp.array([1.0, 0.1, 0.01, 0.001])
+        scales = jnp.log(jnp.stack([jnp.repeat(levels, 4), jnp.tile(times, 2)], axis=1))
         others = ends[None] + (scales @ of.circuit.scaling())[:, None]
         resistance, i_0 = _line(*_seen(of, alone))
         each = others.reshape(-1, of.elements)
@@ -153,7 +148,7 @@ def _line(
     current: Float[Array, " record"], resistance: Float[Array, " record"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """R and I_0 that give the resistances at these currents best, in relative terms."""
-    levels = jnp.geomspace(jnp.min(current) / REACH, jnp.max(current) * REACH, LINES)
+    levels = jnp.geomspace(jnp.min(current) / 100, jnp.max(current) * 100, 200)  # of I_0
     small = jnp.maximum(jnp.max(resistance) * jnp.finfo(resistance.dtype).eps, resistance)
     logs = jnp.log(small)[None] + jnp.log1p(current[None] / levels[:, None])  # of R
     best = jnp.argmin(jnp.var(logs, axis=1))

@@ -21,8 +21,6 @@ from etid.signals.transfer import as_complex, frequency_variable, reciprocal
 from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
 from etid.solvers.matrices import inverse
 
-# Of a period: 42 µs to 5.6 ms at 60 Hz, each 2.3 times the one before.
-TIMES = np.geomspace(1 / 400, 1 / 3, 7)
 # Of Σ r². It was 0.47 or more for resistances that follow late, and 0.16 or less for other misfits:
 # layers, constant phases, clipping, low-passes, gains, other laws of the fall.
 SHARE = 1 / 3
@@ -76,4 +74,5 @@ def _added(
         delayed = to_time(to_harmonics(level) * reciprocal(1 + s * as_complex(time)), points)
         return along((level - delayed) / (1 + level))
 
-    return jax.lax.map(late, jnp.asarray(TIMES))
+    # Of a period: 42 µs to 5.6 ms at 60 Hz, each 2.3 times the one before.
+    return jax.lax.map(late, jnp.asarray(np.geomspace(1 / 400, 1 / 3, 7)))

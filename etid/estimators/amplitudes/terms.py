@@ -49,9 +49,6 @@ from etid.solvers.harmonic_balance import steady_state, to_time
 
 BEYOND = 2  # harmonics of the balance, as a multiple of those of the records
 STILL = 1e-6  # of the pulse rate; stands for 0 Hz, where a series capacitor has no impedance
-# A linear load would have an infinite I_0. The prior of its logarithm keeps it finite; its standard
-# deviation is a factor of 150.
-CURRENT_WIDTH = 5.0
 # Corners of usual anti-alias filters, Butterworth's of fourth order, relative to the sample rate.
 CORNERS = (0.4, 0.3)
 STRONGEST = 1.2  # s, so that either filter alone is possible
@@ -121,7 +118,8 @@ class Amplitudes(eqx.Module):
 
     def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Prior standard deviations of the unknowns."""
-        own = jnp.where(currents(self.circuit), CURRENT_WIDTH, jnp.inf)
+        # A linear load has an infinite I_0. A prior of a factor of 150 keeps it finite.
+        own = jnp.where(currents(self.circuit), 5.0, jnp.inf)
         own = own if self.prior is None else jnp.minimum(own, self.prior.width)
         delays = jnp.broadcast_to(self.given.delay_width, (self.count,))
         rest = jnp.ones(q.size - self.elements - self.count)
