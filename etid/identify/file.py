@@ -102,7 +102,8 @@ def _pin(cores: Any, told: Any, level: int) -> None:
     LOG.setLevel(level)
     LOG.addHandler(logging.handlers.QueueHandler(told))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {cores.get()})
 
@@ -122,6 +123,8 @@ class _Processes(concurrent.futures.ProcessPoolExecutor):
     """
 
     def submit(self, *call: Any, **named: Any) -> concurrent.futures.Future:
+        if not hasattr(signal, "pthread_sigmask"):
+            return super().submit(*call, **named)
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             return super().submit(*call, **named)
