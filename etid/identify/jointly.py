@@ -242,16 +242,6 @@ class _Group:
         found = jax.device_get(fit(*several, self.model, self.driver))
         return unstacked(found)[: len(lanes)]
 
-    @property
-    def changed(self) -> list[bool]:
-        """Whether each recording shows that the driver has changed since its calibration."""
-        return [bool(start.changed) for start in self.starts]
-
-    @property
-    def other(self) -> list[bool]:
-        """Whether each recording shows another circuit or gain."""
-        return [bool(start.other) for start in self.starts]
-
     def several(self) -> list[int]:
         """Checksums of the unloaded records that several recordings share."""
         return [key for key, count in Counter(self.unloaded).items() if count > 1]
@@ -428,24 +418,25 @@ def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit]
         ]
     # A compiled function returns JAX arrays. The checksums must stay a numpy array.
     better = dataclasses.replace(better, method=METHOD, unloaded=driver.unloaded)
-    changed = any(any(group.changed) for group in groups)
+    changed = any(start.changed for group in groups for start in group.starts)
     if changed and not any(np.any(of.used) for of in loads):
         better = dataclasses.replace(better, result=verdict("inconsistent"))
     judged = []
     for group, fit, narrow in zip(groups, found, small, strict=True):
         remarks = np.where(narrow, np.array(group.remarks) | Remark.small_delays, group.remarks)
-        alone = _alone_judged(fit, group.changed, group.other)
+        alone = _alone_judged(fit, group.starts)
         judged.append(concluded(alone, better, remarks.tolist(), group.repeats))
     return judged, better
 
 
-def _alone_judged(fits: Fit, changed: Sequence[bool], other: Sequence[bool]) -> Fit:
+def _alone_judged(fits: Fit, starts: Sequence[_Start]) -> Fit:
     """Fits without remarks on hum, with the verdicts of recordings that take no part.
 
     That is `misfit` for another circuit or gain, and `inconsistent` where the driver has changed.
     """
-    names = np.where(np.asarray(other) & (fits.verdict == "successful"), "misfit", fits.verdict)
-    explained = np.asarray(changed) & np.isin(names, ("successful", "misfit"))
+    changed, other = np.array([(start.changed, start.other) for start in starts]).T
+    names = np.where(other & (fits.verdict == "successful"), "misfit", fits.verdict)
+    explained = changed & np.isin(names, ("successful", "misfit"))
     result = verdicts_of(np.where(explained, "inconsistent", names))
     # The fit of each recording alone decides whether hum is left out.
     return dataclasses.replace(fits, remarks=fits.remarks & ~int(Remark.mains_hum), result=result)
