@@ -186,7 +186,7 @@ def estimates(
             late = load_fit.beyond(own.delay_samples / width, whole[e, e] / width**2)
             by_error = of.errors(eliminated.slope[:e] @ bread)
             # A load that takes no part has its own verdict.
-            wrong = (other.seen() | other.has_other_gain()) & load.used
+            wrong = other.misfit & load.used
             inconsistent = beyond | ((scale | late) & load.used)
             return Found(estimate, wrong, inconsistent, delay, by_error)
 

@@ -135,6 +135,5 @@ def fit_alone(
     own, z = LoadUnknowns.of(q[: start.size], current is not None), q[start.size :]
     tested = model.lane(uncertain, spectrum, sample_rate, current)
     at = jnp.concatenate([own.vector(), z if uncertain is driver else uncertain.mean])
-    scores = load_fit.scores_at(tested, at)
-    other = scores.seen() | scores.has_other_gain()
+    other = load_fit.scores_at(tested, at).misfit
     return Alone(own, least.result, chi2, error, hum, other, model.calibrations.errors(q))

@@ -103,7 +103,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
         count,
     )
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
-    of_gain = -load.gains.outputs
+    of_gain = -outputs
     others = linear.told(rows[of_gain][None])[0] @ information
     slopes = near.by_unknown(near.slopes)
     made = combined(others, slopes.reshape(at.size, -1)).reshape(slopes.shape[1:])
@@ -148,7 +148,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
             of_layer.would_show(load.gains.circuit.scaling()[0]),
         ),
     )
-    wrong = other.seen() | other.has_other_gain() | falling.seen()
+    wrong = other.misfit | falling.seen()
     contradicts = of_scales.contradicts()[1:].any()
     width = load.gains.widths(at)[count]  # of the prior of the delay of V_out
     contradicts |= beyond(late[0] / width, information[count, count] / width**2)

@@ -213,6 +213,11 @@ class Scores(NamedTuple):
         """Whether the score shows that V_out and V_th have different gains."""
         return self.gain.exceeds(SEEN)
 
+    @property
+    def misfit(self) -> Bool[Array, ""]:
+        """Whether the scores show another circuit or another gain of V_out."""
+        return self.seen() | self.has_other_gain()
+
     def doubt(self) -> tuple[Bool[Array, ""], Float[Array, "element element"]]:
         """`Score.doubt` of the gain; none if it is proven, for then the fit is a misfit."""
         likely, cov = self.gain.doubt()
