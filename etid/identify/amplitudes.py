@@ -76,7 +76,7 @@ def _fit(
     rate = jnp.asarray(lanes.sample_rate)[0]
     of = Amplitudes(with_filter(known), feed, circuit, lanes.spectrum, rate, prior)
     estimate = fit_amplitudes(of)
-    fit = judgement.judged(estimate, circuit, feed.result, METHOD, bounds)
+    fit = judgement.judged(estimate, circuit, feed.result, METHOD, bounds, prior)
     fit = judgement.unless(fit, leaves_much(estimate.chi2, estimate.rrse), RESULTS.misfit)
     unsure = fit.stderr.values() > judgement.NO_CURRENT * fit.circuit.values()
     return judgement.unless(fit, jnp.any(unsure & currents(circuit)), RESULTS.insensitive)

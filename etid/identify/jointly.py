@@ -140,7 +140,8 @@ def _together(
     common, cov, found = fit_together(model, groups, several)
 
     def fit(found: Found) -> Fit:
-        fit = judgement.judged(found.estimate, model.circuit, driver.result, METHOD, model.bounds)
+        of_model = METHOD, model.bounds, model.prior
+        fit = judgement.judged(found.estimate, model.circuit, driver.result, *of_model)
         if driver.instrument is not None:
             fit = dataclasses.replace(fit, by_tolerance=by_tolerance(found.by_error.T))
         fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)

@@ -146,7 +146,7 @@ class MaximumLikelihood(AbstractEstimator):
         found = load_fit.fit_circuit(load, starts)
         if known.shape is not None:
             found = found._replace(inconsistent=found.inconsistent | known.shape.differs(spectrum))
-        return found.judged(circuit, driver.result, str(self), self.bounds)
+        return found.judged(circuit, driver.result, str(self), self.bounds, prior)
 
     def describe(self) -> Description:
         """The text for a methods section."""

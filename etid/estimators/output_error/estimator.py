@@ -103,7 +103,7 @@ class OutputError(AbstractEstimator):
         fitted, estimate, other = fit.fit_circuit(
             prediction.prepare(m, samples=samples), driver, starts, prior
         )
-        found = judged(estimate, circuit, driver.result, str(self), self.bounds)
+        found = judged(estimate, circuit, driver.result, str(self), self.bounds, prior)
         limit = EDGES if isinstance(driver, MeasuredCurrent) else MISFIT_CHI2
         off = misses(estimate.chi2, estimate.rrse, INTERPOLATED, limit)
         if isinstance(driver, MeasuredCurrent):
