@@ -5,7 +5,7 @@ import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import TypedDict
+from typing import TypedDict, Unpack
 
 import equinox as eqx
 import jax
@@ -49,7 +49,7 @@ Circuit = AbstractCircuit | str | None
 
 
 class FitOptions(TypedDict, total=False):
-    """The options that overloads of one function share, for type checkers."""
+    """The options of a fit, which overloads of one function share, for type checkers."""
 
     method: Method | None
     fixed: Mapping[str, float] | None
@@ -85,13 +85,10 @@ class Options:
         cls,
         circuits: Sequence[AbstractCircuit] = (),
         *,
-        method: Method | None = None,
-        fixed: Mapping[str, float] | None = None,
-        prior: Mapping[str, tuple[float, float]] | None = None,
-        bounds: Mapping[str, Interval] | None = None,
         order: Order = 5,
         instrument: Instrument | None = None,
         plausible: tuple[float, float] = PLAUSIBLE,
+        **of_fit: Unpack[FitOptions],
     ) -> "Options":
         """The options, from the keywords of a public function.
 
@@ -105,15 +102,15 @@ class Options:
         """
         if instrument is not None:
             require("instrument", instrument, Instrument)
-        estimator = None
+        estimator, method = None, of_fit.get("method")
         if method is not None:
             estimator = method if isinstance(method, AbstractEstimator) else named(str(method))
             check_circuits(estimator, circuits)
         options = cls(
             circuits=tuple(circuits),
             estimator=estimator,
-            known=known_elements(fixed, prior),
-            bounds=bounds_of(bounds),
+            known=known_elements(of_fit.get("fixed"), of_fit.get("prior")),
+            bounds=bounds_of(of_fit.get("bounds")),
             order=order_of(order),
             instrument=instrument,
             plausible=range_of("plausible", plausible),
