@@ -30,8 +30,10 @@ class ElementPrior(eqx.Module):
     width: Float[Array, " element"]
 
     @classmethod
-    def of(cls, known: Known, circuit: AbstractCircuit) -> "ElementPrior":
-        """The prior of the elements of a circuit; raises as `checked` does."""
+    def of(cls, known: Known, circuit: AbstractCircuit) -> "ElementPrior | None":
+        """The prior of the elements of a circuit, None if none is known; raises as `checked`."""
+        if not known:
+            return None
         checked(known, circuit)
         names = circuit.names()
         told, width = jnp.ones(len(names)), jnp.full(len(names), jnp.inf)

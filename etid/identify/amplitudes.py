@@ -39,14 +39,6 @@ from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS
 
 METHOD = "amplitudes"
-# χ² from which on a fit is a misfit, however small the residual is, such as the rounding of a
-# converter whose step is not known. Single fits have score tests for such a residual; several
-# amplitudes have none.
-UNEXPLAINED = 4.0
-# RRSE from which on it is a misfit, whatever χ² is. At an absurdly large gain the noise of V_th
-# would explain any residual: 1, 3 and 5 mA with one seed ended at χ² 0.26 and RRSE 0.78.
-LEFT = 0.5
-SAME = 1.1  # factor up to which amplitudes count as one
 register_description(
     METHOD,
     description(
@@ -61,7 +53,11 @@ register_description(
 
 def leaves_much(chi2: Float[Array, ""], rrse: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether the residual is too large for the noise, or for any trust."""
-    return (chi2 > UNEXPLAINED) | (rrse > LEFT)
+    # Single fits have score tests for a small residual with a large χ², such as the rounding of a
+    # converter whose step is not known; several amplitudes have none. At an absurdly large gain the
+    # noise of V_th would explain any residual: 1, 3 and 5 mA with one seed ended at χ² 0.26 and
+    # RRSE 0.78.
+    return (chi2 > 4.0) | (rrse > 0.5)
 
 
 @program
@@ -129,7 +125,7 @@ def identify_amplitudes(
     load = SkinCurrent() if circuit is None else circuit_of(circuit)
     current_dependent(load.impedance())
     options = Options.of([load], method=MAXIMUM_LIKELIHOOD, fixed=fixed, prior=prior, bounds=bounds)
-    of_elements = ElementPrior.of(options.known, load) if options.known else None
+    of_elements = ElementPrior.of(options.known, load)
     feed = (
         MEASURED_CURRENT
         if driver is None
@@ -147,7 +143,7 @@ def identify_amplitudes(
             return successful(one.recording, fit) if throw else fit
     free = set(np.array(load.names())[currents(load)]).difference(of for of, *_ in options.known)
     spans = [float(one.spans[0]) for one in seen]
-    if free and max(spans) < SAME * min(spans):
+    if free and max(spans) < 1.1 * min(spans):
         raise RecordingError(
             "have one amplitude, and a load that depends on its current needs a second one",
             field="recordings",

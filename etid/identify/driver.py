@@ -82,12 +82,7 @@ def identify_driver(
             likelihood that could choose the order, or nothing that the tolerances could enter.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    options = Options.of(
-        order=order,
-        method=method,
-        plausible=plausible,
-        instrument=instrument,
-    )
+    options = Options.of(order=order, method=method, plausible=plausible, instrument=instrument)
     single = isinstance(calibrations, Recording)
     records = recordings("calibrations", [calibrations] if single else calibrations)
     driver = calibrated(records, options, throw)

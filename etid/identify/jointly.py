@@ -53,7 +53,14 @@ from etid.identify.fitting import (
     refitted,
     remarks_on,
 )
-from etid.identify.options import Circuit, Interval, Options, candidates_of, instrument_of
+from etid.identify.options import (
+    Circuit,
+    FitOptions,
+    Interval,
+    Options,
+    candidates_of,
+    instrument_of,
+)
 from etid.identify.planning import Refusal, batches, failed_fit
 from etid.identify.study import Drivers, common_first, fields_of, table
 from etid.numpy_tier.tiers import program, worth_compiling
@@ -132,10 +139,7 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
 
 
 def _together(
-    model: Joint,
-    groups: list[Loads],
-    several: tuple[int, ...],
-    driver: HarmonicDriver,
+    model: Joint, groups: list[Loads], several: tuple[int, ...], driver: HarmonicDriver
 ) -> tuple[list[Fit], HarmonicDriver, list[Delay], Float[Array, "common common"]]:
     common, cov, found = fit_together(model, groups, several)
 
@@ -330,14 +334,9 @@ def identify_jointly(
         RecordingError: Two recordings with a driver have the same samples of `v_out`.
     """
     require("study", study, Study)
+    of_fit = FitOptions(fixed=fixed, prior=prior, bounds=bounds)
     options = Options.of(
-        candidates_of(circuit),
-        fixed=fixed,
-        prior=prior,
-        bounds=bounds,
-        order=order,
-        instrument=instrument,
-        plausible=plausible,
+        candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit
     )
     drivers = Drivers(study, options)
     _check_steady(study, instrument)
@@ -453,9 +452,8 @@ def _alone_judged(fits: Fit, changed: Sequence[bool], other: Sequence[bool]) -> 
 
 
 def _model(options: Options, driver: HarmonicDriver, shared: bool) -> Joint:
-    circuit, known = options.circuit, options.known
-    prior = ElementPrior.of(known, circuit) if known else None
-    return Joint(circuit, _calibrations(driver), shared, prior, options.bounds)
+    prior = ElementPrior.of(options.known, options.circuit)
+    return Joint(options.circuit, _calibrations(driver), shared, prior, options.bounds)
 
 
 def _calibrations(driver: HarmonicDriver) -> Calibrations:

@@ -17,13 +17,7 @@ from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.output_error.estimator import OutputError
-from etid.estimators.registry import (
-    MAXIMUM_LIKELIHOOD,
-    OUTPUT_ERROR,
-    WITH_CURRENT,
-    Method,
-    named,
-)
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT, Method, named
 from etid.identify.arguments import (
     Interval,
     bounds_of,

@@ -31,8 +31,6 @@ from etid.results.fit import Fit, IdentificationError, Support
 from etid.results.verdicts import message, verdict
 
 TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB
-MOST = 64  # recordings that are read at once if they are short; many more save little time
-AHEAD = 2  # chunks that are read and inspected in advance
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 # Verdicts whose message says more of a recording.
 EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
@@ -61,7 +59,7 @@ def prepared(
     """The next recordings, or the reasons why they cannot be fitted.
 
     Recordings of equal length and rates are inspected together. At least `FEWEST` recordings are
-    taken from `rows`, and up to `MOST` as long as they have no more than `TOGETHER` samples.
+    taken from `rows`, and up to 64 as long as they have no more than `TOGETHER` samples.
 
     Args:
         load: Reads a recording and its driver.
@@ -71,7 +69,7 @@ def prepared(
     found: list[tuple[int, Prepared | Refusal]] = []
     loaded: dict[tuple[int, str, float, float], list[tuple[int, Recording, AbstractFeed]]] = {}
     held = 0
-    for number, row in enumerate(itertools.islice(rows, MOST), 1):
+    for number, row in enumerate(itertools.islice(rows, 64), 1):
         try:
             of, driver = load(row)
         except ERRORS as error:
@@ -178,7 +176,7 @@ def batches(
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,
-        contextlib.closing(prefetch(read, len(calls(count)), AHEAD)) as chunks,
+        contextlib.closing(prefetch(read, len(calls(count)), ahead=2)) as chunks,
     ):
         for row, one in itertools.chain.from_iterable(chunk() for chunk in chunks):
             if isinstance(one, Refusal):

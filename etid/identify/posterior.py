@@ -54,8 +54,6 @@ from etid.results.posterior import Posterior
 from etid.solvers.importance_sampling import drawn
 from etid.solvers.matrices import inverse
 
-AT_ONCE = 16  # draws in one vectorised evaluation
-
 
 class Known(eqx.Module):
     """What is known besides the recording.
@@ -128,7 +126,7 @@ def _costs(
 ) -> Float[Array, " draw"]:
     """F of each draw."""
     terms = terms_of(lane, known, circuit)
-    return jax.lax.map(lambda at: cost(terms, at), q, batch_size=AT_ONCE)
+    return jax.lax.map(lambda at: cost(terms, at), q, batch_size=16)
 
 
 class Impedances(NamedTuple):
@@ -221,12 +219,7 @@ def inside(
 
 @in_float64
 def posterior(
-    fit: Fit[Circuit],
-    recording: Recording | None,
-    driver: Driver | None,
-    *,
-    draws: int,
-    seed: int,
+    fit: Fit[Circuit], recording: Recording | None, driver: Driver | None, *, draws: int, seed: int
 ) -> Posterior[Circuit]:
     """`Fit.posterior`."""
     if draws < 1:
@@ -276,8 +269,7 @@ def given(
             "fit.posterior(recording, driver)"
         )
     recording, feed = fed(recording, driver)
-    if np.ndim(fit.rrse):
-        raise ValueError("this is a batch of fits; take one of them, as in fits[0]")
+    fit.refuse_batch()
     if fit.method.partition("(")[0] != MAXIMUM_LIKELIHOOD.name:
         raise ValueError(
             f"this fit was made by {fit.method}; identify the recording with "
@@ -293,8 +285,7 @@ def given(
     if int(fit.remarks) & Remark.mains_hum:
         lane = lane.without_mains() or lane
     known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
-    told = estimator.known_elements
-    elements = ElementPrior.of(told, fit.circuit) if told else None
+    elements = ElementPrior.of(estimator.known_elements, fit.circuit)
     if estimator.bounds:  # the draws begin with those of the same fit without bounds
         unbounded = dataclasses.replace(estimator, bounds=())
         of = jax.device_get(skin(lane, feed, known, fit.circuit, unbounded))

@@ -38,8 +38,6 @@ from etid.selection.search import usual_circuits
 from etid.selection.selection import Selection
 
 _Kind = TypeVar("_Kind", bound=AbstractCircuit)
-FREQUENCY = np.geomspace(1.0, 1e7, 57)  # [Hz], where two impedances are compared
-EQUAL = 1e-6  # relative difference of two impedances that are equal; a fit reaches 1e-9
 
 
 @overload
@@ -348,6 +346,7 @@ def _are_equal(one: AbstractCircuit, other: AbstractCircuit) -> bool:
 
 
 def _imitates(one: AbstractCircuit, other: AbstractCircuit) -> bool:
-    z = np.asarray(other.response(jnp.asarray(FREQUENCY)))
-    fit = identify_impedance(FREQUENCY, z, stderr=np.abs(z), circuit=one, throw=False)
-    return float(fit.rrse) < EQUAL
+    frequency = np.geomspace(1.0, 1e7, 57)
+    z = np.asarray(other.response(jnp.asarray(frequency)))
+    fit = identify_impedance(frequency, z, stderr=np.abs(z), circuit=one, throw=False)
+    return float(fit.rrse) < 1e-6  # it reaches 1e-9 if they are equal

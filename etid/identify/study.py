@@ -16,7 +16,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import require
 from etid.identify.driver import calibrated
 from etid.identify.fitting import Batch, CandidateFits, notes_of
-from etid.identify.options import Circuit, Interval, Options, candidates_of
+from etid.identify.options import Circuit, FitOptions, Interval, Options, candidates_of
 from etid.identify.planning import Load, batches, failed_fit
 from etid.precision import in_float64
 from etid.recordings.recording import Recording, RecordingError
@@ -30,8 +30,6 @@ from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.selection.common import common, deserves
 from etid.selection.selection import Selection
-
-SAMPLE = 200  # recordings that choose the circuit of a study; a second of work
 
 
 @in_float64
@@ -73,15 +71,9 @@ def identify_study(
         ValueError: There is no loaded recording, or the method cannot use this circuit.
     """
     require("study", study, Study)
+    of_fit = FitOptions(method=method, fixed=fixed, prior=prior, bounds=bounds)
     options = Options.of(
-        candidates_of(circuit),
-        method=method,
-        fixed=fixed,
-        prior=prior,
-        bounds=bounds,
-        order=order,
-        instrument=instrument,
-        plausible=plausible,
+        candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit
     )
     drivers = Drivers(study, options)
     count = len(drivers.paths)
@@ -95,8 +87,7 @@ def common_first(drivers: "Drivers", options: Options) -> Options:
     circuits, paths = options.circuits, drivers.paths
     if len(circuits) == 1:
         return options
-    step = -(-len(paths) // SAMPLE)
-    sample = paths[::step]
+    sample = paths[:: -(-len(paths) // 200)]  # so many take a second
     found, _ = choices(len(sample), drivers.loader(sample), options, False, len(paths))
     first = circuits[common(found, circuits)]
     others = (one for one in circuits if one is not first)
@@ -262,12 +253,7 @@ def _fits(
 
 
 def of_one_circuit(
-    count: int,
-    load: Load,
-    options: Options,
-    progress: bool,
-    total: int,
-    chosen: int | None = None,
+    count: int, load: Load, options: Options, progress: bool, total: int, chosen: int | None = None
 ) -> tuple[Fit, list[str]]:
     """Fits, stacked, and notes of recordings, all with the same circuit.
 

@@ -99,7 +99,7 @@ class OutputError(AbstractEstimator):
         if isinstance(driver, MeasuredCurrent):
             m = _at_rest(m, samples)
         starts = circuit.with_log_values(_starts(m, driver, circuit))
-        prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
+        prior = ElementPrior.of(self.known_elements, circuit)
         fitted, estimate, other = fit.fit_circuit(
             prediction.prepare(m, samples=samples), driver, starts, prior
         )
