@@ -18,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from etid.estimators.element_limits import limited, of_circuit
+from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane
 from etid.identify import changes
 from etid.identify.fitting import FEWEST, Batch, Prepared, is_shared
@@ -82,27 +83,34 @@ def prepared(
                 break
     planned: dict[type[AbstractLane], list[tuple[int, tuple[Inspected, AbstractFeed, Any]]]] = {}
     for row, seen, driver in _inspected(loaded.values()):
-        try:
-            estimator, name = plan(options, seen, driver)
-        except ERRORS as error:
-            found.append((row, Refusal.of(error)))
-            continue
-        refusal = None if name is None else Refusal(name, explained(seen, name))
-        if refusal is None:
-            try:
-                check_default(estimator, options.circuits)
-            except ValueError as error:
-                refusal = Refusal("not_periodic", str(error))
-        if refusal is None:
-            planned.setdefault(estimator.lane, []).append((row, (seen, driver, estimator)))
+        chosen = _planned(options, seen, driver)
+        if isinstance(chosen, Refusal):
+            found.append((row, chosen))
         else:
-            found.append((row, refusal))
+            planned.setdefault(chosen.lane, []).append((row, (seen, driver, chosen)))
     for kind, alike in planned.items():
         lanes = kind.of_several([seen for _, (seen, *_) in alike])
         for (row, (seen, driver, estimator)), lane in zip(alike, lanes, strict=True):
             shared = is_shared(seen, driver)
             found.append((row, Prepared(seen, driver, estimator, lane, shared)))
     return found
+
+
+def _planned(
+    options: Options, seen: Inspected, driver: AbstractFeed
+) -> AbstractEstimator | Refusal:
+    """The estimator of a recording, or why it cannot be fitted."""
+    try:
+        estimator, name = plan(options, seen, driver)
+    except ERRORS as error:
+        return Refusal.of(error)
+    if name is not None:
+        return Refusal(name, explained(seen, name))
+    try:
+        check_default(estimator, options.circuits)
+    except ValueError as error:
+        return Refusal("not_periodic", str(error))
+    return estimator
 
 
 def calls(count: int) -> range:
