@@ -113,11 +113,6 @@ def _planned(
     return estimator
 
 
-def calls(count: int) -> range:
-    """Numbers of the calls of `prepared` that take `count` recordings; the last may take none."""
-    return range(-(-count // FEWEST))
-
-
 def _inspected(
     alike: Iterable[Sequence[tuple[int, Recording, AbstractFeed]]],
 ) -> Iterator[tuple[int, Inspected, AbstractFeed]]:
@@ -176,7 +171,7 @@ def batches(
         key: Equal for recordings of one batch.
     """
     waiting: dict[tuple[Any, ...], Batch] = {}
-    rows = iter(range(count))
+    rows, chunks = iter(range(count)), -(-count // FEWEST)  # of which the last may be empty
 
     @in_float64  # the setting belongs to a thread, and this runs in another one
     def read(_: int) -> list[tuple[int, Prepared | Refusal]]:
@@ -184,9 +179,9 @@ def batches(
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,
-        contextlib.closing(prefetch(read, len(calls(count)), ahead=2)) as chunks,
+        contextlib.closing(prefetch(read, chunks, ahead=2)) as found,
     ):
-        for row, one in itertools.chain.from_iterable(chunk() for chunk in chunks):
+        for row, one in itertools.chain.from_iterable(chunk() for chunk in found):
             if isinstance(one, Refusal):
                 yield row, one
                 bar.update()

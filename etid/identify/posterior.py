@@ -341,19 +341,18 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
         )
     told = driver.instrument or Instrument()
     stated = told.stored()
-    if fit.by_tolerance is None and fit.method == "joint":
+    if fit.by_tolerance is not None:
+        sizes, effects = ERRORS, fit.by_tolerance
+    elif fit.method == "joint":
         raise ValueError(
             "this joint fit has no budget: pass instrument=etid.Instrument() to identify_jointly, "
             "with the tolerances that you know; files of fits keep none"
         )
-    if fit.by_tolerance is None:
+    else:
         driver = dataclasses.replace(driver, instrument=told.narrow())
         lane, known, _ = given(fit, recording, driver)
-        of = dict(
-            zip(BUDGETED, np.asarray(_effects(lane, known, fit.circuit, driver)), strict=True)
-        )
-    else:
-        of = dict(zip(ERRORS, np.asarray(fit.by_tolerance), strict=True))
+        sizes, effects = BUDGETED, _effects(lane, known, fit.circuit, driver)
+    of = dict(zip(sizes, np.asarray(effects), strict=True))
     values = np.asarray(fit.circuit.values())
     cov, shared = (np.diagonal(np.asarray(of)) / values**2 for of in (fit.cov, fit.shared_cov))
     instrument = {name: of[name] for name in stated if name in of}

@@ -326,7 +326,10 @@ def checked(candidates: Iterable[AbstractCircuit | str]) -> tuple[AbstractCircui
             "is empty", field="candidates", remedy="Pass a list, as in [etid.SkinRC()]"
         )
     for one, other in itertools.combinations(found, 2):
-        if _are_equal(one, other):
+        same = type(one) is type(other)
+        if not same and len(one.names()) == len(other.names()):
+            same = _imitates(one, other) and _imitates(other, one)
+        if same:
             raise RecordingError(
                 f"holds {type(one).__name__} and {type(other).__name__}, which have the same "
                 "impedance: no data can tell them apart",
@@ -336,16 +339,8 @@ def checked(candidates: Iterable[AbstractCircuit | str]) -> tuple[AbstractCircui
     return found
 
 
-def _are_equal(one: AbstractCircuit, other: AbstractCircuit) -> bool:
-    """Whether each circuit can have the impedance that the other has at its typical values."""
-    if type(one) is type(other):
-        return True
-    if len(one.names()) != len(other.names()):
-        return False
-    return _imitates(one, other) and _imitates(other, one)
-
-
 def _imitates(one: AbstractCircuit, other: AbstractCircuit) -> bool:
+    """Whether a circuit can have the impedance that another one has at its typical values."""
     frequency = np.geomspace(1.0, 1e7, 57)
     z = np.asarray(other.response(jnp.asarray(frequency)))
     fit = identify_impedance(frequency, z, stderr=np.abs(z), circuit=one, throw=False)

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.lanes import stacked, taken, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import require
@@ -276,15 +275,9 @@ def of_one_circuit(
         single = dataclasses.replace(options, circuits=(circuits[chosen],))
         again, texts = _fits(len(others), lambda i: load(others[i]), single, False, total)
         for row, one, text in zip(others, unstacked(again), texts, strict=True):
-            found[row], notes[row] = _otherwise(found[row], one, text, chosen, circuits)
+            refused = not math.isfinite(float(one.chi2))
+            fits = {chosen: one} if refused else {**found[row].fits, chosen: one}
+            found[row] = Selection.of(fits, chosen, circuits)
+            deserved = "" if refused else deserves(found[row], chosen)
+            notes[row] = " ".join(filter(None, (text, deserved)))
     return concatenated([stacked([one.fit]) for one in found]), notes
-
-
-def _otherwise(
-    found: Selection, fit: Fit, text: str, chosen: int, candidates: Sequence[AbstractCircuit]
-) -> tuple[Selection, str]:
-    """The choice and the note of a recording whose common circuit is not its own choice."""
-    if not math.isfinite(float(fit.chi2)):  # it was refused
-        return Selection.of({chosen: fit}, chosen, candidates), text
-    found = Selection.of({**found.fits, chosen: fit}, chosen, candidates)
-    return found, " ".join(filter(None, (text, deserves(found, chosen))))

@@ -324,15 +324,7 @@ class Fit(Judged, HasSource[Circuit]):
     @property
     def elements(self) -> tuple[str, ...]:
         """Each element as text, with standard error and unit; for one fit."""
-        return tuple(
-            f"{name} {quantity(float(value), unit, float(error))}"
-            for (name, unit), value, error in zip(
-                self.circuit.units().items(),
-                np.asarray(self.circuit.values()),
-                np.asarray(self.stderr.values()),
-                strict=True,
-            )
-        )
+        return tuple(" ".join(" ".join(row).split()) for row in self._rows())
 
     @property
     def changes(self) -> str:
@@ -379,10 +371,13 @@ class Fit(Judged, HasSource[Circuit]):
         doubt = "Is what was told right, and in SI units?" if doubtful and self._told[1] else ""
         return [*filter(None, (self.other_circuit, message(self.verdict), own, doubt))]
 
+    def _rows(self) -> list[tuple[str, str, str]]:
+        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
+        return element_rows(self.circuit.units(), values, errors)
+
     def _overview(self) -> Overview:
         kind, verdict = type(self.circuit).__name__, self.verdict
-        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
-        rows = element_rows(self.circuit.units(), values, errors)
+        rows = self._rows()
         if np.ndim(self.rrse):
             batch = f"{kind} fits, batch of {np.shape(self.rrse)}: {counted(verdict)}"
             return Overview(batch, rows)
