@@ -1,8 +1,6 @@
 """One load, recorded at several amplitudes; its resistance may fall with the current."""
 
 import dataclasses
-import functools
-import operator
 from collections.abc import Iterable, Mapping
 
 import jax
@@ -152,8 +150,6 @@ def identify_amplitudes(
     lanes = [Harmonics.of(one) for one in seen]
     known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
     fit = jax.device_get(_fit(stacked(lanes), known, feed, load, of_elements, options.bounds))
-    of_records = functools.reduce(
-        operator.or_, (remarks_on(one, MAXIMUM_LIKELIHOOD) for one in seen)
-    )
-    fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | of_records))
+    remarks = [fit.remarks, *(remarks_on(one, MAXIMUM_LIKELIHOOD) for one in seen)]
+    fit = dataclasses.replace(fit, remarks=np.asarray(np.bitwise_or.reduce(remarks)))
     return successful(seen[0].recording, fit) if throw else fit

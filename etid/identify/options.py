@@ -240,7 +240,7 @@ def check_instrument(instrument: Instrument | None, estimator: AbstractEstimator
             f"{str(estimator)!r} gives none; use method='maximum_likelihood', or state nothing, as "
             "in instrument=etid.Instrument() or --tolerance drift=0"
         )
-    if instrument.states_errors:
+    if instrument.stored().keys() - {"drift"}:
         raise ValueError(
             "the tolerances of an instrument are parameters of maximum likelihood, and the method "
             f"is {str(estimator)!r}, which has the drift of a driver only; record three pulse "
