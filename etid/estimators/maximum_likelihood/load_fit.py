@@ -60,8 +60,8 @@ class Found(NamedTuple):
         circuit: AbstractCircuit,
         driver_result: RESULTS,
         method: str,
-        bounds: Limits,
-        prior: ElementPrior | None,
+        bounds: Limits = (),
+        prior: ElementPrior | None = None,
     ) -> Fit:
         """The fit with its verdict; for the arguments see `judgement.judged`."""
         fit = judged(self.estimate, circuit, driver_result, method, bounds, prior)
