@@ -1,5 +1,6 @@
 """Loads identified from a measured current: accuracy, delays, batches, and wrong input."""
 
+import csv
 import re
 from typing import Any
 
@@ -64,10 +65,16 @@ def test_a_fixed_element_keeps_its_value_and_helps_the_others(skin, periods):
     recording = skin if periods == 3.0 else recorded(SKIN, periods=periods)
     free = etid.identify_skin(recording)
     fixed = etid.identify_skin(recording, fixed={"r_s": 33e3})
-    np.testing.assert_allclose(fixed.circuit.r_s, 33e3, rtol=1e-8)
+    assert fixed.circuit.r_s == 33e3
     assert fixed.stderr.r_s < 1e-8 * 33e3
     assert fixed.stderr.r_p < 0.9 * free.stderr.r_p
     assert np.abs(off(fixed, SKIN)[1:]).max() < WITHIN
+
+
+@pytest.mark.slow
+def test_a_fixed_element_keeps_its_value_at_several_amplitudes(skin):
+    fit = etid.identify_amplitudes([skin], circuit=etid.SkinRC(), fixed={"r_s": 33e3})
+    assert fit.circuit.r_s == 33e3
 
 
 def test_a_prior_is_one_more_measurement(skin):
@@ -186,8 +193,11 @@ def test_known_elements_of_batches_and_on_the_command_line(skin, tmp_path, capsy
     assert "known_elements" in fits.fit.method
     for fit in (fits[0], etid.Fits.read(tmp_path / "fits.h5")[0]):
         assert fit.verdict == "successful"
-        np.testing.assert_allclose(fit.circuit.r_s, 33e3, rtol=1e-8)
+        assert fit.circuit.r_s == 33e3  # which is not exp(ln 33e3)
         assert fit.stderr.c_p < 1e-13
+    assert cli.main(["export", str(tmp_path / "fits.h5"), "-o", str(tmp_path / "fits.csv")]) == 0
+    (row,) = csv.DictReader((tmp_path / "fits.csv").read_text("utf-8").splitlines())
+    assert row["r_s [ohm]"] == "33000.0"
     etid.write_report(tmp_path / "fits.h5", tmp_path / "page.html")
     assert "r_s = 33000 (fixed)" in (tmp_path / "page.html").read_text("utf-8")
     for options, words in (

@@ -8,7 +8,7 @@ from jax.flatten_util import ravel_pytree
 
 import etid
 from etid.estimators.estimate import DELAY_WIDTH, prior
-from etid.signals.harmonics import spectrum
+from etid.signals.harmonics import filled, harmonics
 from etid.signals.noise import noise
 from etid.signals.transfer import delayed
 from etid.simulation.scenes import Scene, Trial
@@ -30,10 +30,8 @@ def information(driver):
     record = Scene((), KNOWN, snr_db=None, bits=None).simulate(seed=3)["c"]
     noisy = Scene((), KNOWN).simulate(seed=3)["c"]
     rate, size = record.sample_rate, record.v_th.size
-    zero = np.asarray(0.0)
-    f, x, *_, selected = map(
-        np.asarray, spectrum(record.v_th, record.v_out, zero, zero, np.asarray(rate), 3, size)
-    )
+    both = harmonics(np.stack([record.v_th, record.v_out]), 3, size)
+    f, x, *_, selected = map(np.asarray, filled(both, np.zeros(2), rate, 3, size))
     sigma_th, sigma_out = (float(noise(v, np.asarray(0.0))) for v in (noisy.v_th, noisy.v_out))
     parameters, unflatten = ravel_pytree(driver.source)
     at = jnp.append(parameters, driver.calibration.delay_samples[0])

@@ -5,15 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from etid.signals import harmonics as spectra
-from etid.signals.harmonics import harmonics, signal_share, whole_periods
+from etid.signals.harmonics import filled, harmonics, signal_share, whole_periods
 from etid.signals.pulse_train import find_pulses
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
-spectrum = jax.jit(spectra.spectrum, static_argnums=(5, 6))
 RATE, PULSE = 200e3, 60.0
 SLOW = 50e3
+
+
+def spectrum(both, sigma, periods, samples):
+    """Fields of a spectrum."""
+    return filled(harmonics(both, periods, samples), sigma, RATE, periods, samples)
 
 
 @pytest.mark.parametrize(
@@ -90,11 +93,10 @@ def test_harmonics_of_a_long_record_survive_a_clock_that_is_off():
 @pytest.mark.parametrize(("periods", "samples"), [(1, 3333), (3, 10_000), (2, 6667)])
 def test_numpy_and_jax_see_the_same_harmonics(periods, samples):
     generator = np.random.default_rng(8)
-    v, w = np.cumsum(generator.normal(size=(2, samples)), axis=1)
-    scalars = [np.asarray(s) for s in (0.1, 0.2, RATE)]
-    size = periods, samples
-    host = spectra.spectrum(v, w, scalars[0], scalars[1], scalars[2], *size)
-    traced = spectrum(jnp.asarray(v), jnp.asarray(w), *map(jnp.asarray, scalars), *size)
+    both = np.cumsum(generator.normal(size=(2, samples)), axis=1), np.array([0.1, 0.2])
+    host = spectrum(*both, periods, samples)
+    compiled = jax.jit(spectrum, static_argnums=(2, 3))
+    traced = compiled(*map(jnp.asarray, both), periods, samples)
     for one, other in zip(host, traced, strict=True):
         assert isinstance(one, np.ndarray)
         assert one.size % 64 == 0
@@ -113,10 +115,7 @@ def test_numpy_and_jax_see_the_same_harmonics(periods, samples):
 )
 def test_harmonics_that_aliases_reach_are_left_out(samples, highest):
     v = np.random.default_rng(2).normal(size=samples)
-    sigma = np.asarray(1e-3)
-    of = spectra.spectrum(
-        v, v, sigma, sigma, np.asarray(RATE), *whole_periods(samples, RATE, PULSE)
-    )
+    of = spectrum(np.stack([v, v]), np.full(2, 1e-3), *whole_periods(samples, RATE, PULSE))
     frequency, selected = of[0], of[-1]
     used = frequency[np.asarray(selected)]
     assert used.max() < highest * RATE

@@ -60,9 +60,8 @@ def compared(snr_db, seed):
     mean, cov = map(np.asarray, posterior.minimum(*pieces))
     impedances = posterior.Impedances.of_circuit(fit.circuit, mean)
     x = np.stack([impedances.of(q) for q in drawn_by_nuts(pieces, mean, cov, seed)])
-    slopes = impedances.powers[: len(wanted)]  # all elements of this skin are impedances
-    wanted = wanted * np.outer(slopes, slopes)
-    theirs = impedances.logs(posterior.stretched(x, *impedances.moments(mean, cov), wanted))
+    (at, own), (_, wanted) = (impedances.moments(mean, of) for of in (cov, wanted))
+    theirs = impedances.logs(posterior.stretched(x, at, own, wanted))
     ended = time.perf_counter()
     logs = np.log(np.asarray(ours.draws.values()))
     centre = ours.weights @ logs

@@ -133,7 +133,10 @@ class AbstractCircuit(Overviewed, eqx.Module):
         Returns:
             A new circuit; this circuit does not change.
         """
-        values = jnp.exp(log_values)
+        return self.with_values(jnp.exp(log_values))
+
+    def with_values(self: _Same, values: Float[Array | np.ndarray, "*lane parameter"]) -> _Same:
+        """A circuit of the same class with these parameters in SI units."""
         return type(self)(**{name: values[..., i] for i, name in enumerate(self.names())})
 
     @property

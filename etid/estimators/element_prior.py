@@ -22,24 +22,31 @@ class ElementPrior(eqx.Module):
     """Prior of the logarithms of the elements.
 
     Attributes:
-        centre: Means; 0 for elements without a prior.
-        width: Standard deviations; infinite for elements without a prior.
+        told: Values of the elements [SI], whose logarithms are the means; 1 without a prior.
+        width: Standard deviations of the logarithms; infinite for elements without a prior.
     """
 
-    centre: Float[Array, " element"]
+    told: Float[Array, " element"]
     width: Float[Array, " element"]
 
     @classmethod
-    def of(cls, known: Known, circuit: AbstractCircuit) -> "ElementPrior":
-        """The prior of the elements of a circuit; raises as `checked` does."""
+    def of(cls, known: Known, circuit: AbstractCircuit) -> "ElementPrior | None":
+        """The prior of the elements of a circuit, None if none is known; raises as `checked`."""
+        if not known:
+            return None
         checked(known, circuit)
         names = circuit.names()
-        centre, width = jnp.zeros(len(names)), jnp.full(len(names), jnp.inf)
+        told, width = jnp.ones(len(names)), jnp.full(len(names), jnp.inf)
         for name, mean, deviation in known:
             row = names.index(name)
-            centre = centre.at[row].set(jnp.log(mean))
+            told = told.at[row].set(mean)
             width = width.at[row].set(max(deviation / mean, FIXED))
-        return cls(centre, width)
+        return cls(told, width)
+
+    @property
+    def centre(self) -> Float[Array, " element"]:
+        """Means of the logarithms; 0 for elements without a prior."""
+        return jnp.log(self.told)
 
     @property
     def precision(self) -> Float[Array, " element"]:
@@ -49,6 +56,10 @@ class ElementPrior(eqx.Module):
     def placed(self, logs: Float[Array, "*start element"]) -> Float[Array, "*start element"]:
         """Starts with the known elements at their means."""
         return jnp.where(jnp.isfinite(self.width), self.centre, logs)
+
+    def exact(self, values: Float[Array, " element"]) -> Float[Array, " element"]:
+        """Estimates [SI], in which fixed elements are as they were told, to the last digit."""
+        return jnp.where(self.width <= FIXED, self.told, values)
 
 
 def require_element(name: str, circuit: AbstractCircuit) -> None:

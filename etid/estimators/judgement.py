@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Support
@@ -62,10 +63,11 @@ def judged(
     driver_result: RESULTS,
     method: str,
     bounds: Limits = (),
+    prior: ElementPrior | None = None,
 ) -> Fit:
     """The fit of an estimate of the logarithms of the elements, with its verdict.
 
-    Bounds of elements that the circuit lacks do not count.
+    Bounds of elements that the circuit lacks do not count. Elements that `prior` fixes are exact.
     """
     fitted = circuit.with_log_values(estimate.parameters)
     values = fitted.values()
@@ -80,8 +82,9 @@ def judged(
             support = dataclasses.replace(support, deviance=support.deviance + deviance)
         errors = jnp.sqrt(jnp.diagonal(cov)) / inside
         values = jnp.where(jnp.isfinite(inside), inside, values)
-        fitted = circuit.with_log_values(jnp.log(values))
-    at_bound = 0
+    if prior is not None:
+        values = prior.exact(values)
+    fitted, at_bound = circuit.with_values(values), 0
     if outside is not None:
         at_bound = jnp.where(jnp.any(outside != 0), int(Remark.at_bound), 0)
     settled = estimate.result == optx.RESULTS.successful

@@ -21,7 +21,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
-from etid.signals.harmonics import ALIASED, Spectrum, aliases, joins_aliases, spectrum
+from etid.signals.harmonics import ALIASED, Spectrum, aliases, filled, harmonics, joins_aliases
 from etid.signals.noise import Measurement, coloured, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
@@ -164,8 +164,9 @@ class Harmonics(AbstractLane):
         """
         if periods[0] == 0:
             raise ValueError(f"{m.v_out.shape[0]} samples hold no whole pulse period")
-        records = m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate
-        fields = map(jnp.asarray, spectrum(*records, *periods))
+        both = harmonics(jnp.stack([of[: periods[1]] for of in (m.v_th, m.v_out)]), *periods)
+        sigma = jnp.stack([m.sigma_th, m.sigma_out])
+        fields = map(jnp.asarray, filled(both, sigma, m.sample_rate, *periods))
         frequency, x, y, of_x, of_y, selected = fields
         if joins_aliases(*periods):
             of_x = of_x + aliases(x, of_x, *periods).variance

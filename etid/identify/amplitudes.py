@@ -1,8 +1,6 @@
 """One load, recorded at several amplitudes; its resistance may fall with the current."""
 
 import dataclasses
-import functools
-import operator
 from collections.abc import Iterable, Mapping
 
 import jax
@@ -39,14 +37,6 @@ from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS
 
 METHOD = "amplitudes"
-# χ² from which on a fit is a misfit, however small the residual is, such as the rounding of a
-# converter whose step is not known. Single fits have score tests for such a residual; several
-# amplitudes have none.
-UNEXPLAINED = 4.0
-# RRSE from which on it is a misfit, whatever χ² is. At an absurdly large gain the noise of V_th
-# would explain any residual: 1, 3 and 5 mA with one seed ended at χ² 0.26 and RRSE 0.78.
-LEFT = 0.5
-SAME = 1.1  # factor up to which amplitudes count as one
 register_description(
     METHOD,
     description(
@@ -61,7 +51,11 @@ register_description(
 
 def leaves_much(chi2: Float[Array, ""], rrse: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether the residual is too large for the noise, or for any trust."""
-    return (chi2 > UNEXPLAINED) | (rrse > LEFT)
+    # Single fits have score tests for a small residual with a large χ², such as the rounding of a
+    # converter whose step is not known; several amplitudes have none. At an absurdly large gain the
+    # noise of V_th would explain any residual: 1, 3 and 5 mA with one seed ended at χ² 0.26 and
+    # RRSE 0.78.
+    return (chi2 > 4.0) | (rrse > 0.5)
 
 
 @program
@@ -76,7 +70,7 @@ def _fit(
     rate = jnp.asarray(lanes.sample_rate)[0]
     of = Amplitudes(with_filter(known), feed, circuit, lanes.spectrum, rate, prior)
     estimate = fit_amplitudes(of)
-    fit = judgement.judged(estimate, circuit, feed.result, METHOD, bounds)
+    fit = judgement.judged(estimate, circuit, feed.result, METHOD, bounds, prior)
     fit = judgement.unless(fit, leaves_much(estimate.chi2, estimate.rrse), RESULTS.misfit)
     unsure = fit.stderr.values() > judgement.NO_CURRENT * fit.circuit.values()
     return judgement.unless(fit, jnp.any(unsure & currents(circuit)), RESULTS.insensitive)
@@ -129,7 +123,7 @@ def identify_amplitudes(
     load = SkinCurrent() if circuit is None else circuit_of(circuit)
     current_dependent(load.impedance())
     options = Options.of([load], method=MAXIMUM_LIKELIHOOD, fixed=fixed, prior=prior, bounds=bounds)
-    of_elements = ElementPrior.of(options.known, load) if options.known else None
+    of_elements = ElementPrior.of(options.known, load)
     feed = (
         MEASURED_CURRENT
         if driver is None
@@ -147,7 +141,7 @@ def identify_amplitudes(
             return successful(one.recording, fit) if throw else fit
     free = set(np.array(load.names())[currents(load)]).difference(of for of, *_ in options.known)
     spans = [float(one.spans[0]) for one in seen]
-    if free and max(spans) < SAME * min(spans):
+    if free and max(spans) < 1.1 * min(spans):
         raise RecordingError(
             "have one amplitude, and a load that depends on its current needs a second one",
             field="recordings",
@@ -156,8 +150,6 @@ def identify_amplitudes(
     lanes = [Harmonics.of(one) for one in seen]
     known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
     fit = jax.device_get(_fit(stacked(lanes), known, feed, load, of_elements, options.bounds))
-    of_records = functools.reduce(
-        operator.or_, (remarks_on(one, MAXIMUM_LIKELIHOOD) for one in seen)
-    )
-    fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | of_records))
+    remarks = [fit.remarks, *(remarks_on(one, MAXIMUM_LIKELIHOOD) for one in seen)]
+    fit = dataclasses.replace(fit, remarks=np.asarray(np.bitwise_or.reduce(remarks)))
     return successful(seen[0].recording, fit) if throw else fit

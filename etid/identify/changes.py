@@ -40,18 +40,8 @@ from etid.results.verdicts import verdict
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import reciprocal
 
-CLEAN = 0.03  # of the sample rate; below, there are no aliases
 UNEQUAL = 5e-4  # largest change of the amplitude of V_th; cuts between samples cause 1e-4
-EXPLAINED = (
-    "successful",
-    "misfit",
-    "inconsistent",
-    "biased",
-)  # verdicts that a change may cause
 RIDGE = 1e-10  # added to the diagonal, for elements without effect
-LARGEST = 20.0  # limit on the change of a logarithm; an undetermined change can be arbitrary
-USUAL = 12.0  # χ² that exceeds its mean by no more is never unlikely
-DRIVER = 2e-3  # allowed change of a driver, expressed as a change of the calibration resistor
 
 
 class Change(NamedTuple):
@@ -101,7 +91,7 @@ def courses(periods: int) -> Float[np.ndarray, "course period"]:
 
 def unlikely(square: Float[np.ndarray, "..."], freedom: int, count: int) -> Bool[np.ndarray, "..."]:
     """Whether χ² is so large that the largest of `count` exceeds it by chance in `FALSE_ALARMS`."""
-    if not np.any(square > freedom + USUAL):
+    if not np.any(square > freedom + 12.0):  # never unlikely
         return np.zeros(square.shape, bool)
     import scipy.special  # takes a fifth of a second, which few recordings need
 
@@ -173,7 +163,7 @@ def _changes(of: Repeats, slopes: np.ndarray, allowed: np.ndarray) -> Change:
     matters |= (uneven > UNEQUAL) & (other > allowed).any(1)
     units = unit[:, :tested]
     log = fitted.theta[lane, best] / units * reach
-    factor = np.exp(np.clip(log, -LARGEST, LARGEST))
+    factor = np.exp(np.clip(log, -20.0, 20.0))  # an undetermined change can be arbitrary
     error = np.sqrt(np.diagonal(cov[lane, best], axis1=1, axis2=2)) / units * reach
     return Change(factor - 1, factor * error, matters)
 
@@ -188,7 +178,7 @@ def _equations(
         without aliases and with them; units of the parameters, which make the diagonal of the
         equations 1; Σ η² / variance for each course.
     """
-    high: np.ndarray = np.greater(of.frequency, CLEAN * of.sample_rate[:, None])
+    high: np.ndarray = np.greater(of.frequency, 0.03 * of.sample_rate[:, None])  # aliases begin
     plain = course @ of.gain
     turn = of.turn.conj()
     aliased = (turn[:, :, None] * of.gain).sum(1)
@@ -306,9 +296,8 @@ def driver_judged(
     """
     if not z_th.size or driver.verdict != "successful":
         return driver
-    slopes = z_th / (r_load[:, None] + z_th)  # ∂ ln G/∂ ln R
-    changes = found(repeats, slopes[:, None, :], np.full((len(repeats), 1), DRIVER))
-    if changes.seen.any():
+    slopes = z_th / (r_load[:, None] + z_th)  # ∂ ln G/∂ ln R: as if the resistor had changed
+    if found(repeats, slopes[:, None, :], np.full((len(repeats), 1), 2e-3)).seen.any():
         return dataclasses.replace(driver, result=verdict("changed"))
     return driver
 

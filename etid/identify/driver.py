@@ -1,9 +1,7 @@
 """Identification of a driver: pre-flight, baseline, refinement, verdict."""
 
 import dataclasses
-import functools
 import logging
-import operator
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -82,12 +80,7 @@ def identify_driver(
             likelihood that could choose the order, or nothing that the tolerances could enter.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    options = Options.of(
-        order=order,
-        method=method,
-        plausible=plausible,
-        instrument=instrument,
-    )
+    options = Options.of(order=order, method=method, plausible=plausible, instrument=instrument)
     single = isinstance(calibrations, Recording)
     records = recordings("calibrations", [calibrations] if single else calibrations)
     driver = calibrated(records, options, throw)
@@ -140,8 +133,8 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
         driver = _driver(seen, options.order, estimator, arrays)
     for one in seen if LOG.isEnabledFor(logging.INFO) else ():
         log_changes(one)
-    remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
-    driver = dataclasses.replace(driver, remarks=np.asarray(int(remarks) | int(driver.remarks)))
+    remarks = [int(of.remarks) for of in (driver, *seen)]
+    driver = dataclasses.replace(driver, remarks=np.asarray(np.bitwise_or.reduce(remarks)))
     if isinstance(driver, HarmonicDriver):
         unloaded = np.array([checksum(one) for one in seen])
         driver = dataclasses.replace(driver, unloaded=unloaded)

@@ -35,7 +35,7 @@ from tqdm import tqdm
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.lookup import class_path
 from etid.estimators.registry import Method
-from etid.identify.options import Circuit, Interval, Options, candidates_of
+from etid.identify.options import Circuit, FitOptions, Interval, Options, candidates_of
 from etid.identify.study import Drivers, common_first, identify_part
 from etid.precision import in_float64
 from etid.recordings.causes import LOG
@@ -273,15 +273,11 @@ def fit_file(
             has calibrations of no driver or of several, or another process is writing the target.
         ValueError: The source has no loaded recording.
     """
+    if order is None:
+        order = 5 if driver is None else AUTO
+    of_fit = FitOptions(method=method, fixed=fixed, prior=prior, bounds=bounds)
     options = Options.of(
-        candidates_of(circuit),
-        method=method,
-        fixed=fixed,
-        prior=prior,
-        bounds=bounds,
-        order=order if order is not None else 5 if driver is None else AUTO,
-        instrument=instrument,
-        plausible=plausible,
+        candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit
     )
     target = pathlib.Path(target)
     sources = tuple(os.path.abspath(one) for one in (source, driver) if one is not None)

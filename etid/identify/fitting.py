@@ -51,13 +51,9 @@ from etid.selection.search import search
 
 FEWEST = 16  # recordings that are read and fitted at once, however long they are
 HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least `FEWEST`
-SPARSE = 16  # every 16th sample enters a checksum
 # Relative standard deviation of the resonance, above which loads are searched twice. At 60 dB and
 # 100 kHz it is 0.17 to 1.2 of 28 transformers that resonate at 95 kHz, of others 0.01 to 0.03.
 OPEN = 0.1
-KEPT = 4  # drivers, for which `known_of` is kept
-# Verdicts to whose message a note adds.
-NOTED = ("changed", "misfit", "out_of_bounds", "inconsistent")
 _Outcome = TypeVar("_Outcome", Fit, Driver)
 
 
@@ -148,14 +144,14 @@ class _Same:
         return isinstance(other, _Same) and self.driver is other.driver
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=4)
 def _known_of(driver: _Same, frequency: bytes, shared: bool, estimator: AbstractEstimator) -> Any:
     return known_at(jax.device_put(np.frombuffer(frequency)), driver.driver, shared, estimator)
 
 
 def checksum(seen: Inspected) -> int:
     """Checksum that identifies an unloaded record; a part of its noise is enough."""
-    return zlib.crc32(seen.v_th[::SPARSE].tobytes())
+    return zlib.crc32(seen.v_th[::16].tobytes())
 
 
 def is_shared(seen: Inspected, driver: AbstractFeed) -> bool:
@@ -410,26 +406,23 @@ def concluded(
     names, remarked = fits.verdict, fits.remarks | np.asarray(remarks, int)
     coarse = (remarked & Remark.coarse_converter) > 0
     names = np.where(coarse & (names == "insensitive"), "resolution", names)
-    names = np.where(change.seen & np.isin(names, changes.EXPLAINED), "changed", names)
-    support = fits.support
-    if support is None:
-        support = Support.unknown(fits.cov.shape[-1], len(names))
+    explained = np.isin(names, ("successful", "misfit", "inconsistent", "biased"))
+    names = np.where(change.seen & explained, "changed", names)
     return dataclasses.replace(
         fits,
         remarks=remarked,
         change=np.where(before, known, change.size),
         change_stderr=np.where(before, known_stderr, change.stderr),
         result=verdicts_of(names),
-        support=support,
+        support=fits.support or Support.unknown(fits.cov.shape[-1], len(names)),
     )
 
 
 def notes_of(fits: Fit) -> list[str]:
     """The note of each of several fits."""
-    names = fits.verdict.tolist()
-    return [
-        taken(fits, row).note if name in NOTED else message(name) for row, name in enumerate(names)
-    ]
+    more = "changed", "misfit", "out_of_bounds", "inconsistent"  # than the message of the verdict
+    names = enumerate(fits.verdict.tolist())
+    return [taken(fits, row).note if name in more else message(name) for row, name in names]
 
 
 def remarks_on(seen: Inspected, estimator: AbstractEstimator) -> int:

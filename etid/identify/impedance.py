@@ -34,19 +34,12 @@ from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.remarks import Remark, texts
 from etid.results.data import MeasuredImpedance, with_data
-from etid.results.fit import CHANGES, Fit, IdentificationError, Support, complex_rrse
+from etid.results.fit import Fit, IdentificationError, Support, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.solvers.matrices import inverse
 
-MAX_STEPS = 500
-LEVELS = np.geomspace(0.1, 10.0, 5)  # impedance levels of the starts, relative to the data
-CORNERS = 5  # corner frequencies of the starts, from the lowest to the highest frequency
-SOLVER = LevenbergMarquardt()
 LACK = 1e-4  # by chance, if the chain is given; its choice makes it three times as likely
-RUNS = 3.5  # standard deviations of the autocorrelation of white noise: 1 spectrum in 4 000
-TAILS = 2.5  # rms over what the median says; of 40 normal numbers in 5 of 1 000 000 draws
-MEDIAN = 0.6745  # of the size of a normal number
 
 
 class PassiveFit(NamedTuple):
@@ -86,13 +79,14 @@ def _fit(
     times = (typical - of_level * resistance) / jnp.where(slow, of_time, 1.0)
     shortest = jnp.where(slow, times, jnp.inf).min()
     corner = jnp.where(slow.any(), 1 / (2 * jnp.pi * jnp.exp(shortest)), 1.0)  # [Hz], roughly
-    corners = jnp.exp(jnp.linspace(jnp.log(frequency.min()), jnp.log(frequency.max()), CORNERS))
-    levels = size + jnp.log(jnp.asarray(LEVELS))
+    corners = jnp.exp(jnp.linspace(jnp.log(frequency.min()), jnp.log(frequency.max()), 5))
+    levels = size + jnp.log(np.geomspace(0.1, 10.0, 5))
 
     def from_corner(faster: Float[Array, ""]) -> optx.Solution:
         starts = (typical - of_time * faster)[None, :] + levels[:, None] * of_level[None, :]
         q0 = best_start(lambda q: residual(q, None), starts)
-        return optx.least_squares(residual, SOLVER, q0, max_steps=MAX_STEPS, throw=False)
+        solver = LevenbergMarquardt()
+        return optx.least_squares(residual, solver, q0, max_steps=500, throw=False)
 
     every = jax.lax.map(from_corner, jnp.log(corners / corner))
     likeliest = jnp.nanargmin(every.stats["normal_equations"].objective)
@@ -109,6 +103,10 @@ def _fit(
     fitted = circuit.with_log_values(q)
     values = fitted.values()
     settled = solution.result == optx.RESULTS.successful
+    terms = jnp.asarray(2.0 * z.size)
+    support = dataclasses.replace(  # no changes of the circuit are tested
+        Support.unknown(q.size), deviance=2 * equations.objective, terms=terms
+    )
     return Fit(
         circuit=fitted,
         cov=cov * jnp.outer(values, values),
@@ -125,7 +123,7 @@ def _fit(
         steps=solution.stats["num_steps"],
         method="impedance",
         remarks=remark,
-        support=_support(2 * equations.objective, z.size, q.size) if known else None,
+        support=support if known else None,
     )
 
 
@@ -151,8 +149,9 @@ def _judged(
     square = jnp.sum(e**2) / (n - p)
     of_steps = jnp.mean((parts[:, 1:] - parts[:, :-1]) ** 2) / 2
     rho = 1 - of_steps / jnp.where(square > 0, square, 1.0)
-    usual = (jnp.median(jnp.abs(e)) / MEDIAN) ** 2
-    signs = [rho > RUNS / n**0.5, jnp.sum(e**2) > passive.most, square > TAILS**2 * usual]
+    usual = (jnp.median(jnp.abs(e)) / 0.6745) ** 2  # the median of the size of a normal number
+    # By chance 1 spectrum in 4 000 has such runs, 5 of 1 000 000 of 40 frequencies such tails.
+    signs = [rho > 3.5 / n**0.5, jnp.sum(e**2) > passive.most, square > 2.5**2 * usual]
     noise = jnp.stack([of_steps, passive.square, usual])
     excess = jnp.sqrt(jnp.max(jnp.where(jnp.stack(signs), square - noise, 0.0)))
     equal = inverse(slope.T @ slope)
@@ -184,13 +183,6 @@ def _remarks(z: Complex[np.ndarray, " frequency"]) -> Remark:
     if not np.imag(z).any():
         return Remark.no_phase
     return Remark.positive_imaginary if np.median(np.imag(z)) > 0 else Remark(0)
-
-
-def _support(deviance: Float[Array, ""], values: int, elements: int) -> Support:
-    """The likelihood of a fit; no changes of the circuit are tested."""
-    terms, untested = jnp.asarray(2.0 * values), jnp.asarray(jnp.nan)
-    nothing = jnp.zeros(CHANGES), jnp.zeros(()), jnp.zeros(elements)
-    return Support(deviance, terms, *nothing, untested)
 
 
 @in_float64

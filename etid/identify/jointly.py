@@ -53,7 +53,14 @@ from etid.identify.fitting import (
     refitted,
     remarks_on,
 )
-from etid.identify.options import Circuit, Interval, Options, candidates_of, instrument_of
+from etid.identify.options import (
+    Circuit,
+    FitOptions,
+    Interval,
+    Options,
+    candidates_of,
+    instrument_of,
+)
 from etid.identify.planning import Refusal, batches, failed_fit
 from etid.identify.study import Drivers, common_first, fields_of, table
 from etid.numpy_tier.tiers import program, worth_compiling
@@ -67,13 +74,14 @@ from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
 from etid.results.instrument import ERRORS, Instrument, by_tolerance
 from etid.results.study_fits import PLAUSIBLE, StudyFits
-from etid.results.verdicts import RESULTS, verdict, verdict_names, verdicts_of
+from etid.results.verdicts import RESULTS, verdict, verdicts_of
 from etid.selection.delays import upper_limit
 
 METHOD = "joint"
-SINGLE = (
+NOT_PERIODIC = Refusal(
+    "not_periodic",
     "The record or its calibration holds less than two whole pulse periods, or begins in an edge. "
-    "A joint fit needs whole periods. Record more of them, or identify the recording alone."
+    "A joint fit needs whole periods. Record more of them, or identify the recording alone.",
 )
 register_description(
     METHOD,
@@ -132,15 +140,13 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
 
 
 def _together(
-    model: Joint,
-    groups: list[Loads],
-    several: tuple[int, ...],
-    driver: HarmonicDriver,
+    model: Joint, groups: list[Loads], several: tuple[int, ...], driver: HarmonicDriver
 ) -> tuple[list[Fit], HarmonicDriver, list[Delay], Float[Array, "common common"]]:
     common, cov, found = fit_together(model, groups, several)
 
     def fit(found: Found) -> Fit:
-        fit = judgement.judged(found.estimate, model.circuit, driver.result, METHOD, model.bounds)
+        of_model = METHOD, model.bounds, model.prior
+        fit = judgement.judged(found.estimate, model.circuit, driver.result, *of_model)
         if driver.instrument is not None:
             fit = dataclasses.replace(fit, by_tolerance=by_tolerance(found.by_error.T))
         fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)
@@ -189,7 +195,7 @@ def _narrower(
         rate: Sampling rate of the calibrations [Hz].
         widest: Width of the prior in these fits [samples].
     """
-    good = np.concatenate([_successful(fit) for fit in fits])
+    good = np.concatenate([fit.verdict == "successful" for fit in fits])
     if good.sum() < 2 or any(np.any(np.asarray(loads.sample_rate) != rate) for loads in groups):
         return None
     late, own, slope = (
@@ -199,10 +205,6 @@ def _narrower(
     width = upper_limit(late, own, slope, cov, widest)
     errors = np.sqrt(own + np.einsum("ij,jk,ik->i", slope, cov, slope))
     return width if width < np.median(errors) else None
-
-
-def _successful(fits: Fit) -> Bool[np.ndarray, " lane"]:
-    return verdict_names(fits.result) == "successful"
 
 
 def _key(one: Prepared) -> tuple[Any, ...]:
@@ -319,14 +321,9 @@ def identify_jointly(
         RecordingError: Two recordings with a driver have the same samples of `v_out`.
     """
     require("study", study, Study)
+    of_fit = FitOptions(fixed=fixed, prior=prior, bounds=bounds)
     options = Options.of(
-        candidates_of(circuit),
-        fixed=fixed,
-        prior=prior,
-        bounds=bounds,
-        order=order,
-        instrument=instrument,
-        plausible=plausible,
+        candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit
     )
     drivers = Drivers(study, options)
     _check_steady(study, instrument)
@@ -335,15 +332,22 @@ def identify_jointly(
     only = dataclasses.replace(options, circuits=(options.circuit,))
     fits: dict[int, Fit] = {}
     notes = [""] * len(paths)
+    refused: dict[int, Refusal] = {}
+
+    def keep(rows: Sequence[int], found: Fit) -> None:
+        for row, fit, text in zip(rows, unstacked(found), notes_of(found), strict=True):
+            fits[row], notes[row] = fit, text
+
     groups: dict[tuple[str, ...], dict[Any, _Group]] = {}
     first: dict[bytes, str] = {}
     for batch in batches(len(paths), drivers.loader(paths), only, progress, _key):
-        if isinstance(batch, Batch) and isinstance(batch.like.driver, MeasuredCurrent):
+        if not isinstance(batch, Batch):
+            row, refusal = batch
+            refused[row] = NOT_PERIODIC if refusal.name == NOT_PERIODIC.name else refusal
+        elif isinstance(batch.like.driver, MeasuredCurrent):
             found = batch.fitted(only.circuits, len(paths)).only
-            alone = dataclasses.replace(found, method=METHOD)
-            for row, fit, text in zip(batch.rows, unstacked(alone), notes_of(alone), strict=True):
-                fits[row], notes[row] = fit, text
-        elif isinstance(batch, Batch) and batch.like.estimator.lane.periodic:
+            keep(batch.rows, dataclasses.replace(found, method=METHOD))
+        elif batch.like.estimator.lane.periodic:
             for row, seen in zip(batch.rows, batch.seen, strict=True):
                 check_new(f"study[{paths[row]!r}]", seen.recording, first)
             lengths = groups.setdefault(drivers.of(batch.seen[0].recording), {})
@@ -351,25 +355,18 @@ def identify_jointly(
             lengths[key] = lengths.get(key) or _Group(only, batch.like, len(paths))
             lengths[key].add(batch)
         else:
-            refusal = Refusal("not_periodic", SINGLE)
-            rows = batch.rows if isinstance(batch, Batch) else [batch[0]]
-            if not isinstance(batch, Batch) and batch[1].name != "not_periodic":
-                refusal = batch[1]
-            for row in rows:
-                fits[row], notes[row] = failed_fit(refusal.name, only, METHOD), refusal.note
+            refused |= dict.fromkeys(batch.rows, NOT_PERIODIC)
+    for row, refusal in refused.items():
+        fits[row], notes[row] = failed_fit(refusal.name, only, METHOD), refusal.note
     for names, lengths in tqdm(groups.items(), unit="driver", disable=not progress):
         together = list(lengths.values())
         found, drivers.found[names] = _fit_together(only, together)
         for group, judged in zip(together, found, strict=True):
-            of_group = zip(group.rows, unstacked(judged), notes_of(judged), strict=True)
-            for row, one, text in of_group:
-                fits[row], notes[row] = one, text
+            keep(group.rows, judged)
     of_drivers = [of for of in drivers.found.values() if isinstance(of, HarmonicDriver)]
-    if any(
-        of.instrument is not None for of in of_drivers
-    ):  # a fit that no driver is needed for, or that failed, has no part
+    if any(of.instrument is not None for of in of_drivers):
         none = np.full((len(ERRORS), len(only.circuit.names())), np.nan)
-        for row, fit in fits.items():
+        for row, fit in fits.items():  # of a fit that failed, or that no driver is needed for
             if fit.by_tolerance is None:
                 fits[row] = dataclasses.replace(fit, by_tolerance=none)
     ordered = stacked([fits[row] for row in range(len(paths))])
@@ -409,13 +406,9 @@ def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit]
         model = dataclasses.replace(model, calibrations=again)
         others, better, *_ = together(model, loads, several, better)
         others = jax.device_get(others)
-        small = [
-            _successful(one) & _successful(other) for one, other in zip(found, others, strict=True)
-        ]
-        found = [
-            replaced(first, where, taken(second, where))
-            for first, second, where in zip(found, others, small, strict=True)
-        ]
+        for number, (first, second) in enumerate(zip(found, others, strict=True)):
+            where = (first.verdict == "successful") & (second.verdict == "successful")
+            small[number], found[number] = where, replaced(first, where, taken(second, where))
     # A compiled function returns JAX arrays. The checksums must stay a numpy array.
     better = dataclasses.replace(better, method=METHOD, unloaded=driver.unloaded)
     changed = any(start.changed for group in groups for start in group.starts)
@@ -434,18 +427,17 @@ def _alone_judged(fits: Fit, starts: Sequence[_Start]) -> Fit:
 
     That is `misfit` for another circuit or gain, and `inconsistent` where the driver has changed.
     """
-    changed, other = np.array([(start.changed, start.other) for start in starts]).T
+    changed, other = np.array([(bool(one.changed), bool(one.other)) for one in starts]).T
     names = np.where(other & (fits.verdict == "successful"), "misfit", fits.verdict)
-    explained = changed & np.isin(names, ("successful", "misfit"))
-    result = verdicts_of(np.where(explained, "inconsistent", names))
+    names = np.where(changed & np.isin(names, ("successful", "misfit")), "inconsistent", names)
+    result = verdicts_of(names)
     # The fit of each recording alone decides whether hum is left out.
     return dataclasses.replace(fits, remarks=fits.remarks & ~int(Remark.mains_hum), result=result)
 
 
 def _model(options: Options, driver: HarmonicDriver, shared: bool) -> Joint:
-    circuit, known = options.circuit, options.known
-    prior = ElementPrior.of(known, circuit) if known else None
-    return Joint(circuit, _calibrations(driver), shared, prior, options.bounds)
+    prior = ElementPrior.of(options.known, options.circuit)
+    return Joint(options.circuit, _calibrations(driver), shared, prior, options.bounds)
 
 
 def _calibrations(driver: HarmonicDriver) -> Calibrations:

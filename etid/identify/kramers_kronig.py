@@ -24,14 +24,10 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.precision import in_float64
 
 MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
-NEAR = 1.2  # times the least mean square; no data tell such models apart
 EXACT = 1e-4  # relative residual that is as good as none
 _COLUMNS = 3  # of a chain without relaxations
-_FREE = 4  # least degrees of freedom of a residual that is judged
-_DENSE = 5.0  # relaxations per decade that describe any circuit to better than 0.1 %
 _SPARSE = 3.0  # least frequencies per decade
 FAIL = 0.01  # relative residual above which a measurement without known errors is suspect
-FALSE_ALARMS = 1e-3  # share of right measurements with right standard errors that do not pass
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -126,7 +122,8 @@ def kramers_kronig(
             f"there are {f.size} frequencies in {decades:.2g} decades; the test needs at least "
             f"{_SPARSE:g} in each"
         )
-    most = min(2 * f.size - _COLUMNS - _FREE, int(_DENSE * decades) + 2)
+    # Five in a decade describe any circuit to 0.1 %; four degrees of freedom show a residual.
+    most = min(2 * f.size - _COLUMNS - 4, int(5.0 * decades) + 2)
     counts = range(1, max(f.size - _COLUMNS, most) + 1)
     tried = [_fitted(f, z, sigma, count) for count in counts]
     degrees = [2 * f.size - _COLUMNS - count for count in counts]
@@ -134,13 +131,15 @@ def kramers_kronig(
         float(np.sum(np.abs((one - z) / sigma) ** 2)) / free
         for one, free in zip(tried, degrees, strict=True)
     ]
-    near = max(NEAR * min(squares), EXACT**2 if stderr is None else 1.0)
+    # No data tell models apart whose mean squares differ by less than a fifth.
+    near = max(1.2 * min(squares), EXACT**2 if stderr is None else 1.0)
     chosen = next(number for number, square in enumerate(squares) if square <= near)
     fitted = tried[chosen]
     residual = (z - fitted) / np.abs(fitted)
     if stderr is None:
         return KramersKronig(f, fitted, residual, chosen + 1, None, FAIL)
-    by_chance = float(scipy.special.chdtri(degrees[chosen], FALSE_ALARMS)) / degrees[chosen]
+    # One right measurement of a thousand exceeds it.
+    by_chance = float(scipy.special.chdtri(degrees[chosen], 1e-3)) / degrees[chosen]
     limit = max(MISFIT_CHI2, by_chance)
     return KramersKronig(f, fitted, residual, chosen + 1, squares[chosen], limit)
 

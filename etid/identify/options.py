@@ -5,7 +5,7 @@ import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import TypedDict
+from typing import TypedDict, Unpack
 
 import equinox as eqx
 import jax
@@ -17,13 +17,7 @@ from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.output_error.estimator import OutputError
-from etid.estimators.registry import (
-    MAXIMUM_LIKELIHOOD,
-    OUTPUT_ERROR,
-    WITH_CURRENT,
-    Method,
-    named,
-)
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT, Method, named
 from etid.identify.arguments import (
     Interval,
     bounds_of,
@@ -49,7 +43,7 @@ Circuit = AbstractCircuit | str | None
 
 
 class FitOptions(TypedDict, total=False):
-    """The options that overloads of one function share, for type checkers."""
+    """The options of a fit, which overloads of one function share, for type checkers."""
 
     method: Method | None
     fixed: Mapping[str, float] | None
@@ -85,13 +79,10 @@ class Options:
         cls,
         circuits: Sequence[AbstractCircuit] = (),
         *,
-        method: Method | None = None,
-        fixed: Mapping[str, float] | None = None,
-        prior: Mapping[str, tuple[float, float]] | None = None,
-        bounds: Mapping[str, Interval] | None = None,
         order: Order = 5,
         instrument: Instrument | None = None,
         plausible: tuple[float, float] = PLAUSIBLE,
+        **of_fit: Unpack[FitOptions],
     ) -> "Options":
         """The options, from the keywords of a public function.
 
@@ -105,15 +96,15 @@ class Options:
         """
         if instrument is not None:
             require("instrument", instrument, Instrument)
-        estimator = None
+        estimator, method = None, of_fit.get("method")
         if method is not None:
             estimator = method if isinstance(method, AbstractEstimator) else named(str(method))
             check_circuits(estimator, circuits)
         options = cls(
             circuits=tuple(circuits),
             estimator=estimator,
-            known=known_elements(fixed, prior),
-            bounds=bounds_of(bounds),
+            known=known_elements(of_fit.get("fixed"), of_fit.get("prior")),
+            bounds=bounds_of(of_fit.get("bounds")),
             order=order_of(order),
             instrument=instrument,
             plausible=range_of("plausible", plausible),
@@ -249,7 +240,7 @@ def check_instrument(instrument: Instrument | None, estimator: AbstractEstimator
             f"{str(estimator)!r} gives none; use method='maximum_likelihood', or state nothing, as "
             "in instrument=etid.Instrument() or --tolerance drift=0"
         )
-    if instrument.states_errors:
+    if instrument.stored().keys() - {"drift"}:
         raise ValueError(
             "the tolerances of an instrument are parameters of maximum likelihood, and the method "
             f"is {str(estimator)!r}, which has the drift of a driver only; record three pulse "

@@ -18,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from etid.estimators.element_limits import limited, of_circuit
+from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane
 from etid.identify import changes
 from etid.identify.fitting import FEWEST, Batch, Prepared, is_shared
@@ -31,8 +32,6 @@ from etid.results.fit import Fit, IdentificationError, Support
 from etid.results.verdicts import message, verdict
 
 TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB
-MOST = 64  # recordings that are read at once if they are short; many more save little time
-AHEAD = 2  # chunks that are read and inspected in advance
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 # Verdicts whose message says more of a recording.
 EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
@@ -61,7 +60,7 @@ def prepared(
     """The next recordings, or the reasons why they cannot be fitted.
 
     Recordings of equal length and rates are inspected together. At least `FEWEST` recordings are
-    taken from `rows`, and up to `MOST` as long as they have no more than `TOGETHER` samples.
+    taken from `rows`, and up to 64 as long as they have no more than `TOGETHER` samples.
 
     Args:
         load: Reads a recording and its driver.
@@ -71,7 +70,7 @@ def prepared(
     found: list[tuple[int, Prepared | Refusal]] = []
     loaded: dict[tuple[int, str, float, float], list[tuple[int, Recording, AbstractFeed]]] = {}
     held = 0
-    for number, row in enumerate(itertools.islice(rows, MOST), 1):
+    for number, row in enumerate(itertools.islice(rows, 64), 1):
         try:
             of, driver = load(row)
         except ERRORS as error:
@@ -84,21 +83,11 @@ def prepared(
                 break
     planned: dict[type[AbstractLane], list[tuple[int, tuple[Inspected, AbstractFeed, Any]]]] = {}
     for row, seen, driver in _inspected(loaded.values()):
-        try:
-            estimator, name = plan(options, seen, driver)
-        except ERRORS as error:
-            found.append((row, Refusal.of(error)))
-            continue
-        refusal = None if name is None else Refusal(name, explained(seen, name))
-        if refusal is None:
-            try:
-                check_default(estimator, options.circuits)
-            except ValueError as error:
-                refusal = Refusal("not_periodic", str(error))
-        if refusal is None:
-            planned.setdefault(estimator.lane, []).append((row, (seen, driver, estimator)))
+        chosen = _planned(options, seen, driver)
+        if isinstance(chosen, Refusal):
+            found.append((row, chosen))
         else:
-            found.append((row, refusal))
+            planned.setdefault(chosen.lane, []).append((row, (seen, driver, chosen)))
     for kind, alike in planned.items():
         lanes = kind.of_several([seen for _, (seen, *_) in alike])
         for (row, (seen, driver, estimator)), lane in zip(alike, lanes, strict=True):
@@ -107,9 +96,21 @@ def prepared(
     return found
 
 
-def calls(count: int) -> range:
-    """Numbers of the calls of `prepared` that take `count` recordings; the last may take none."""
-    return range(-(-count // FEWEST))
+def _planned(
+    options: Options, seen: Inspected, driver: AbstractFeed
+) -> AbstractEstimator | Refusal:
+    """The estimator of a recording, or why it cannot be fitted."""
+    try:
+        estimator, name = plan(options, seen, driver)
+    except ERRORS as error:
+        return Refusal.of(error)
+    if name is not None:
+        return Refusal(name, explained(seen, name))
+    try:
+        check_default(estimator, options.circuits)
+    except ValueError as error:
+        return Refusal("not_periodic", str(error))
+    return estimator
 
 
 def _inspected(
@@ -170,7 +171,7 @@ def batches(
         key: Equal for recordings of one batch.
     """
     waiting: dict[tuple[Any, ...], Batch] = {}
-    rows = iter(range(count))
+    rows, chunks = iter(range(count)), -(-count // FEWEST)  # of which the last may be empty
 
     @in_float64  # the setting belongs to a thread, and this runs in another one
     def read(_: int) -> list[tuple[int, Prepared | Refusal]]:
@@ -178,9 +179,9 @@ def batches(
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,
-        contextlib.closing(prefetch(read, len(calls(count)), AHEAD)) as chunks,
+        contextlib.closing(prefetch(read, chunks, ahead=2)) as found,
     ):
-        for row, one in itertools.chain.from_iterable(chunk() for chunk in chunks):
+        for row, one in itertools.chain.from_iterable(chunk() for chunk in found):
             if isinstance(one, Refusal):
                 yield row, one
                 bar.update()

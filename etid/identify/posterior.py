@@ -27,7 +27,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_limits import Limits, of_circuit
@@ -54,8 +54,6 @@ from etid.results.posterior import Posterior
 from etid.solvers.importance_sampling import drawn
 from etid.solvers.matrices import inverse
 
-AT_ONCE = 16  # draws in one vectorised evaluation
-
 
 class Known(eqx.Module):
     """What is known besides the recording.
@@ -69,6 +67,12 @@ class Known(eqx.Module):
     driver: GivenDriver
     elements: ElementPrior | None
     bounds: Limits = eqx.field(static=True, default=())
+
+    def allows(self, circuits: AbstractCircuit) -> Bool[np.ndarray, " draw"]:
+        """Whether the elements of each circuit are finite and inside their bounds."""
+        of = {name: np.asarray(getattr(circuits, name)) for name in circuits.names()}
+        inside = [(of[name] >= low) & (of[name] <= high) for name, low, high in self.bounds]
+        return np.all([*map(np.isfinite, of.values()), *inside], axis=0)
 
 
 class Minimum(eqx.Module):
@@ -122,7 +126,7 @@ def _costs(
 ) -> Float[Array, " draw"]:
     """F of each draw."""
     terms = terms_of(lane, known, circuit)
-    return jax.lax.map(lambda at: cost(terms, at), q, batch_size=AT_ONCE)
+    return jax.lax.map(lambda at: cost(terms, at), q, batch_size=16)
 
 
 class Impedances(NamedTuple):
@@ -154,11 +158,11 @@ class Impedances(NamedTuple):
             return np.where(powers != 0, least + np.log(x) / powers, x)
 
     def moments(
-        self, mean: Float[np.ndarray, " q"], cov: Float[np.ndarray, "q q"]
-    ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "q q"]]:
-        """The impedances at a mean of q, and their covariance, to first order."""
+        self, mean: Float[np.ndarray, " q"], cov: Float[np.ndarray, "part part"]
+    ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "part part"]]:
+        """The impedances at a mean of q, and the covariance of the first ones, to first order."""
         x = self.of(mean)
-        slopes = np.where(self.powers != 0, self.powers * x, 1.0)
+        slopes = np.where(self.powers != 0, self.powers * x, 1.0)[: len(cov)]
         return x, cov * np.outer(slopes, slopes)
 
 
@@ -215,12 +219,7 @@ def inside(
 
 @in_float64
 def posterior(
-    fit: Fit[Circuit],
-    recording: Recording | None,
-    driver: Driver | None,
-    *,
-    draws: int,
-    seed: int,
+    fit: Fit[Circuit], recording: Recording | None, driver: Driver | None, *, draws: int, seed: int
 ) -> Posterior[Circuit]:
     """`Fit.posterior`."""
     if draws < 1:
@@ -228,34 +227,28 @@ def posterior(
     lane, known, cov = given(fit, recording, driver)
     least, own = map(np.asarray, minimum(lane, known, fit.circuit))
     if not np.isfinite(own).all():
-        raise ValueError(f"the recording does not determine all elements of {fit}")
+        raise _undetermined(fit)
+    impedances = Impedances.of_circuit(fit.circuit, least)
+    at_least, (_, wanted) = impedances.moments(least, own), impedances.moments(least, cov)
 
-    names, impedances = fit.circuit.names(), Impedances.of_circuit(fit.circuit, least)
-    at_least = impedances.moments(least, own)
-    slopes = np.where(impedances.powers != 0, impedances.powers, 1.0)[: len(cov)]
-    wanted = cov * np.outer(slopes, slopes)
-
-    def elements(x: Float[np.ndarray, "draw q"]) -> Float[np.ndarray, "draw element"]:
-        return np.exp(impedances.logs(stretched(x, *at_least, wanted)))
+    def elements(x: Float[np.ndarray, "draw q"]) -> Circuit:
+        logs = impedances.logs(stretched(x, *at_least, wanted))
+        return fit.circuit.with_values(np.exp(logs))
 
     def costs(x: Float[np.ndarray, "draw q"]) -> Float[np.ndarray, " draw"]:
-        q, values = impedances.logs(x), elements(x)
-        possible = np.isfinite(q).all(axis=1) & np.isfinite(values).all(axis=1)
+        q = impedances.logs(x)
+        possible = np.isfinite(q).all(axis=1) & known.allows(elements(x))
         q[~possible] = least
-        for name, low, high in known.bounds:
-            value = values[:, names.index(name)]
-            possible &= (value >= low) & (value <= high)
         found = np.asarray(_costs(lane, known, fit.circuit, jax.device_put(q)))
         return np.where(possible, found, np.inf)
 
     begin = impedances.moments(*inside(fit, least, own, cov)) if known.bounds else at_least
     x, weights = drawn(costs, *begin, draws, np.random.default_rng(seed))
     if not np.isfinite(weights).all():
-        raise ValueError(f"the recording does not determine all elements of {fit}")
+        raise _undetermined(fit)
     possible = weights > 0
-    found = dict(zip(names, elements(x[possible]).T, strict=True))
-    circuit = type(fit.circuit)(**found)
-    return Posterior(fit.circuit, np.asarray(fit.cov), circuit, weights[possible])
+    found = elements(x[possible])
+    return Posterior(fit.circuit, np.asarray(fit.cov), found, weights[possible])
 
 
 def given(
@@ -276,8 +269,7 @@ def given(
             "fit.posterior(recording, driver)"
         )
     recording, feed = fed(recording, driver)
-    if np.ndim(fit.rrse):
-        raise ValueError("this is a batch of fits; take one of them, as in fits[0]")
+    fit.refuse_batch()
     if fit.method.partition("(")[0] != MAXIMUM_LIKELIHOOD.name:
         raise ValueError(
             f"this fit was made by {fit.method}; identify the recording with "
@@ -293,8 +285,7 @@ def given(
     if int(fit.remarks) & Remark.mains_hum:
         lane = lane.without_mains() or lane
     known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
-    told = estimator.known_elements
-    elements = ElementPrior.of(told, fit.circuit) if told else None
+    elements = ElementPrior.of(estimator.known_elements, fit.circuit)
     if estimator.bounds:  # the draws begin with those of the same fit without bounds
         unbounded = dataclasses.replace(estimator, bounds=())
         of = jax.device_get(skin(lane, feed, known, fit.circuit, unbounded))
@@ -311,8 +302,12 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
     values = np.asarray(fit.circuit.values())
     cov = np.asarray(fit.cov) / np.outer(values, values)
     if not (np.isfinite(cov).all() and (np.linalg.eigvalsh(cov) > 0).all()):
-        raise ValueError(f"the recording does not determine all elements of {fit}")
+        raise _undetermined(fit)
     return cov
+
+
+def _undetermined(fit: Fit) -> ValueError:
+    return ValueError(f"the recording does not determine all elements of {fit}")
 
 
 @program
@@ -346,19 +341,18 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
         )
     told = driver.instrument or Instrument()
     stated = told.stored()
-    if fit.by_tolerance is None and fit.method == "joint":
+    if fit.by_tolerance is not None:
+        sizes, effects = ERRORS, fit.by_tolerance
+    elif fit.method == "joint":
         raise ValueError(
             "this joint fit has no budget: pass instrument=etid.Instrument() to identify_jointly, "
             "with the tolerances that you know; files of fits keep none"
         )
-    if fit.by_tolerance is None:
+    else:
         driver = dataclasses.replace(driver, instrument=told.narrow())
         lane, known, _ = given(fit, recording, driver)
-        of = dict(
-            zip(BUDGETED, np.asarray(_effects(lane, known, fit.circuit, driver)), strict=True)
-        )
-    else:
-        of = dict(zip(ERRORS, np.asarray(fit.by_tolerance), strict=True))
+        sizes, effects = BUDGETED, _effects(lane, known, fit.circuit, driver)
+    of = dict(zip(sizes, np.asarray(effects), strict=True))
     values = np.asarray(fit.circuit.values())
     cov, shared = (np.diagonal(np.asarray(of)) / values**2 for of in (fit.cov, fit.shared_cov))
     instrument = {name: of[name] for name in stated if name in of}

@@ -25,9 +25,6 @@ from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import MeasuredCurrent
 from etid.signals.filtering import TAPS
 
-ITERATIONS = 3  # for two delays of 0.01 samples; the first iteration leaves 1e-4 of them
-BAND = 0.4  # of the sample rate; above it, anti-alias filters leave noise and aliases
-
 
 @program
 def _fitted(
@@ -134,9 +131,9 @@ def periodic_voltage(
     samples = 2j * np.pi * f / sample_rate  # s times the sample interval
     x, y = np.fft.rfft(v_th)[1:], np.fft.rfft(v_out)[1:]
     excess = samples * (r_load - z_load)
-    used = f < BAND * sample_rate
+    used = f < 0.4 * sample_rate  # above, anti-alias filters leave noise and aliases
     own = late = 0.0
-    for _ in range(ITERATIONS):
+    for _ in range(3):  # the first one leaves 1e-4 of two delays of 0.01 samples
         total = z_load + z_th + late * excess
         predicted = x * z_load / total * np.exp(-samples * own)
         slopes = np.stack([-samples * predicted, -excess / total * predicted], axis=1)[used]

@@ -24,11 +24,6 @@ from etid.results.fit import Fit
 from etid.results.posterior import Profile
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 
-WIDE = 3.5  # [standard errors] range of a profile to each side
-POINTS = 29  # of a profile
-STEEP = 1e3  # standard deviations of a residual one standard error outside a bound
-MAX_STEPS = 200
-
 
 class _Walls(eqx.Module):
     """Bounds of the logarithms of the elements, as steep residuals outside.
@@ -44,17 +39,14 @@ class _Walls(eqx.Module):
     error: Float[Array, " element"]
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " element"]:
-        """Distances outside, in a small part of a standard error."""
+        """Distances outside, in thousandths of a standard error."""
         own = q[: self.low.size]
         outside = jnp.maximum(self.low - own, 0.0) + jnp.maximum(own - self.high, 0.0)
-        return STEEP * outside / self.error
+        return 1e3 * outside / self.error
 
 
 def _least(
-    terms: Load,
-    walls: _Walls,
-    start: Float[Array, " q"],
-    free: Float[Array, "q free"],
+    terms: Load, walls: _Walls, start: Float[Array, " q"], free: Float[Array, "q free"]
 ) -> Float[Array, " q"]:
     """The minimum of F among `start` + `free` @ r, inside the walls."""
 
@@ -67,9 +59,8 @@ def _least(
         return NormalEquations.of(value, jacobian.T)
 
     solver = LevenbergMarquardt(rtol=1e-6, ftol=1e-8, equations=equations)
-    found = optx.least_squares(
-        residual, solver, jnp.zeros(free.shape[1]), max_steps=MAX_STEPS, throw=False
-    )
+    begin = jnp.zeros(free.shape[1])
+    found = optx.least_squares(residual, solver, begin, max_steps=200, throw=False)
     return start + free @ found.value
 
 
@@ -93,16 +84,15 @@ def _profile(
     least = Minimum.of(lane, known, circuit)
     size, count = least.q.size, stretched.size
     errors = jnp.sqrt(jnp.diagonal(least.cov))[:count]
-    names, ends = circuit.names(), np.tile([-np.inf, np.inf], (count, 1))
+    names, limits = circuit.names(), np.tile([-np.inf, np.inf], (count, 1))
     for name, low, high in known.bounds:
-        ends[names.index(name)] = np.log(low) if low > 0 else -np.inf, np.log(high)
+        limits[names.index(name)] = np.log(low) if low > 0 else -np.inf, np.log(high)
     own = least.q[:count]
-    low, high = ((jnp.asarray(end) - own) / stretched for end in ends.T)  # from the minimum
+    low, high = ((jnp.asarray(end) - own) / stretched for end in limits.T)  # from the minimum
     walls = _Walls(own + low * errors, own + high * errors, errors)
     middle = jnp.clip(0.0, low[number], high[number])
-    steps = jnp.linspace(
-        jnp.maximum(middle - WIDE, low[number]), jnp.minimum(middle + WIDE, high[number]), POINTS
-    )
+    ends = jnp.clip(middle + np.array([-3.5, 3.5]), low[number], high[number])  # [standard errors]
+    steps = jnp.linspace(ends[0], ends[1], 29)
     others = jnp.where(jnp.arange(size - 1) < number, jnp.arange(size - 1), jnp.arange(1, size))
     free = jnp.eye(size)[:, others]
     towards = least.cov[:, number] / errors[number]

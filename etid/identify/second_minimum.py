@@ -18,8 +18,6 @@ from etid.results.fit import Fit
 from etid.results.verdicts import verdicts_of
 
 ASIDE = 0.2  # samples from the first start to the second; the minima are 0.1 to 0.17 apart
-UNSETTLED = 1e30  # deviance of a search that found no minimum
-APART = 2.0  # standard errors; two searches that end in one minimum differ by at most 0.2
 
 
 def likelier(first: Fit, second: Fit) -> Fit:
@@ -35,7 +33,8 @@ def likelier(first: Fit, second: Fit) -> Fit:
     rows = np.flatnonzero(less < 0).tolist()
     kept = replaced(first, rows, taken(second, rows)) if rows else first
     moved = np.abs(np.asarray(second.circuit.values()) - np.asarray(first.circuit.values()))
-    apart = (moved > APART * np.asarray(kept.stderr.values())).any(axis=1)
+    # Two searches that end in one minimum differ by at most 0.2 standard errors.
+    apart = (moved > 2.0 * np.asarray(kept.stderr.values())).any(axis=1)
     unclear = apart & (np.abs(less) < SEEN**2) & (kept.verdict == "successful")
     names = np.where(unclear, "driver_unclear", kept.verdict)
     return dataclasses.replace(kept, result=verdicts_of(names))
@@ -45,4 +44,4 @@ def _deviance(fits: Fit) -> Float[np.ndarray, " recording"]:
     """Deviance of each fit; a large number if its search did not settle."""
     assert fits.support is not None
     settled = np.isfinite(fits.support.deviance) & (fits.verdict != "max_steps_reached")
-    return np.where(settled, fits.support.deviance, UNSETTLED)
+    return np.where(settled, fits.support.deviance, 1e30)

@@ -38,8 +38,6 @@ from etid.selection.search import usual_circuits
 from etid.selection.selection import Selection
 
 _Kind = TypeVar("_Kind", bound=AbstractCircuit)
-FREQUENCY = np.geomspace(1.0, 1e7, 57)  # [Hz], where two impedances are compared
-EQUAL = 1e-6  # relative difference of two impedances that are equal; a fit reaches 1e-9
 
 
 @overload
@@ -328,7 +326,10 @@ def checked(candidates: Iterable[AbstractCircuit | str]) -> tuple[AbstractCircui
             "is empty", field="candidates", remedy="Pass a list, as in [etid.SkinRC()]"
         )
     for one, other in itertools.combinations(found, 2):
-        if _are_equal(one, other):
+        same = type(one) is type(other)
+        if not same and len(one.names()) == len(other.names()):
+            same = _imitates(one, other) and _imitates(other, one)
+        if same:
             raise RecordingError(
                 f"holds {type(one).__name__} and {type(other).__name__}, which have the same "
                 "impedance: no data can tell them apart",
@@ -338,16 +339,9 @@ def checked(candidates: Iterable[AbstractCircuit | str]) -> tuple[AbstractCircui
     return found
 
 
-def _are_equal(one: AbstractCircuit, other: AbstractCircuit) -> bool:
-    """Whether each circuit can have the impedance that the other has at its typical values."""
-    if type(one) is type(other):
-        return True
-    if len(one.names()) != len(other.names()):
-        return False
-    return _imitates(one, other) and _imitates(other, one)
-
-
 def _imitates(one: AbstractCircuit, other: AbstractCircuit) -> bool:
-    z = np.asarray(other.response(jnp.asarray(FREQUENCY)))
-    fit = identify_impedance(FREQUENCY, z, stderr=np.abs(z), circuit=one, throw=False)
-    return float(fit.rrse) < EQUAL
+    """Whether a circuit can have the impedance that another one has at its typical values."""
+    frequency = np.geomspace(1.0, 1e7, 57)
+    z = np.asarray(other.response(jnp.asarray(frequency)))
+    fit = identify_impedance(frequency, z, stderr=np.abs(z), circuit=one, throw=False)
+    return float(fit.rrse) < 1e-6  # it reaches 1e-9 if they are equal

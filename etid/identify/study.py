@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.lanes import stacked, taken, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import require
 from etid.identify.driver import calibrated
 from etid.identify.fitting import Batch, CandidateFits, notes_of
-from etid.identify.options import Circuit, Interval, Options, candidates_of
+from etid.identify.options import Circuit, FitOptions, Interval, Options, candidates_of
 from etid.identify.planning import Load, batches, failed_fit
 from etid.precision import in_float64
 from etid.recordings.recording import Recording, RecordingError
@@ -30,8 +29,6 @@ from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.selection.common import common, deserves
 from etid.selection.selection import Selection
-
-SAMPLE = 200  # recordings that choose the circuit of a study; a second of work
 
 
 @in_float64
@@ -73,15 +70,9 @@ def identify_study(
         ValueError: There is no loaded recording, or the method cannot use this circuit.
     """
     require("study", study, Study)
+    of_fit = FitOptions(method=method, fixed=fixed, prior=prior, bounds=bounds)
     options = Options.of(
-        candidates_of(circuit),
-        method=method,
-        fixed=fixed,
-        prior=prior,
-        bounds=bounds,
-        order=order,
-        instrument=instrument,
-        plausible=plausible,
+        candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit
     )
     drivers = Drivers(study, options)
     count = len(drivers.paths)
@@ -95,8 +86,7 @@ def common_first(drivers: "Drivers", options: Options) -> Options:
     circuits, paths = options.circuits, drivers.paths
     if len(circuits) == 1:
         return options
-    step = -(-len(paths) // SAMPLE)
-    sample = paths[::step]
+    sample = paths[:: -(-len(paths) // 200)]  # so many take a second
     found, _ = choices(len(sample), drivers.loader(sample), options, False, len(paths))
     first = circuits[common(found, circuits)]
     others = (one for one in circuits if one is not first)
@@ -262,12 +252,7 @@ def _fits(
 
 
 def of_one_circuit(
-    count: int,
-    load: Load,
-    options: Options,
-    progress: bool,
-    total: int,
-    chosen: int | None = None,
+    count: int, load: Load, options: Options, progress: bool, total: int, chosen: int | None = None
 ) -> tuple[Fit, list[str]]:
     """Fits, stacked, and notes of recordings, all with the same circuit.
 
@@ -290,15 +275,9 @@ def of_one_circuit(
         single = dataclasses.replace(options, circuits=(circuits[chosen],))
         again, texts = _fits(len(others), lambda i: load(others[i]), single, False, total)
         for row, one, text in zip(others, unstacked(again), texts, strict=True):
-            found[row], notes[row] = _otherwise(found[row], one, text, chosen, circuits)
+            refused = not math.isfinite(float(one.chi2))
+            fits = {chosen: one} if refused else {**found[row].fits, chosen: one}
+            found[row] = Selection.of(fits, chosen, circuits)
+            deserved = "" if refused else deserves(found[row], chosen)
+            notes[row] = " ".join(filter(None, (text, deserved)))
     return concatenated([stacked([one.fit]) for one in found]), notes
-
-
-def _otherwise(
-    found: Selection, fit: Fit, text: str, chosen: int, candidates: Sequence[AbstractCircuit]
-) -> tuple[Selection, str]:
-    """The choice and the note of a recording whose common circuit is not its own choice."""
-    if not math.isfinite(float(fit.chi2)):  # it was refused
-        return Selection.of({chosen: fit}, chosen, candidates), text
-    found = Selection.of({**found.fits, chosen: fit}, chosen, candidates)
-    return found, " ".join(filter(None, (text, deserves(found, chosen))))

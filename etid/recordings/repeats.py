@@ -168,8 +168,8 @@ def _of_equal_periods(
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
     own = _deviations(loaded, at, layout, sigma)
     if group[0].has_current:
-        currents = [current for current, _ in records]
-        return _of_currents(group[0], layout, loaded, currents, own, sigma_th, at)
+        other = _deviations([current for current, _ in records], at, layout, sigma_th)
+        return _of_currents(sample_rate, layout, own, other)
     # Of V_th only the amplitude is wanted. If some of the samples were left out, the aliases of its
     # edges would look like another amplitude in each period: by 1e-3 if every fourth remains.
     low = bands(sample_rate, pulse_rate, 1 / 32)
@@ -209,21 +209,14 @@ def _turn(late: Float[np.ndarray, "lane period"]) -> Complex[np.ndarray, "lane p
 
 
 def _of_currents(
-    first: Inspected,
-    layout: Bands,
-    loaded: Sequence[Float[np.ndarray, "_"]],
-    currents: Sequence[Float[np.ndarray, "_"]],
-    own: "_Deviations",
-    sigma: Float[np.ndarray, " lane"],
-    at: Float[np.ndarray, "lane period"],
+    sample_rate: float, layout: Bands, own: "_Deviations", other: "_Deviations"
 ) -> list[Repeats]:
     """Deviations of the quotients of voltage and current."""
-    other = _deviations(currents, at, layout, sigma)
     pairs = []
-    for records, of in ((loaded, own), (currents, other)):
-        raw = _transforms(records, _starts(records, at, layout), layout)
+    clock = _turns(own.late * (2 * np.pi / layout.size), own.raw.shape[2])  # one for both
+    for of in (own, other):
         unit = np.sqrt(of.power.sum(1))  # squares of small currents would underflow
-        turned = raw * _turns(own.late * (2 * np.pi / layout.size), raw.shape[2])  # one clock
+        turned = of.raw * clock
         turned = turned / unit[:, None, None]
         noise = np.repeat(of.variance * of.power / unit[:, None] ** 2, layout.number, axis=1)
         pairs.append((turned, turned.mean(1), noise))
@@ -241,9 +234,9 @@ def _of_currents(
         rest = deviation[row] - np.real(deviation[row] @ basis.conj().T) @ basis
         gain.append(np.add.reduceat(rest * mean[row].conj(), layout.edges, axis=1) / power[row])
         smooth.append(np.add.reduceat(mean[row].conj() * basis, layout.edges, axis=1))
-    none = np.zeros(at.shape)  # an amplitude that changes in both records does no harm
+    none = np.zeros(own.late.shape)  # an amplitude that changes in both records does no harm
     parts = np.stack(gain), power, np.stack(smooth), 1 / power, _turn(own.late)
-    return _rows(first.recording.sample_rate, layout, (*parts, none, np.ones(len(none))))
+    return _rows(sample_rate, layout, (*parts, none, np.ones(len(none))))
 
 
 def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
@@ -266,13 +259,14 @@ def _turned(v_out: Float[np.ndarray, " time"], of: Inspected) -> Float[np.ndarra
 
 
 class _Deviations(NamedTuple):
-    """`gain`, `power` and `variance` as in `Repeats`, the mean, and the delay of each cut."""
+    """`gain`, `power` and `variance` as in `Repeats`, mean, delay of each cut, `_transforms`."""
 
     gain: np.ndarray
     power: np.ndarray
     variance: np.ndarray
     mean: np.ndarray
     late: np.ndarray
+    raw: np.ndarray
 
 
 def _deviations(
@@ -283,7 +277,8 @@ def _deviations(
 ) -> "_Deviations":
     """Deviations of the periods with the starts `at` [samples]."""
     periods = at.shape[1]
-    starts = _starts(records, at, layout)
+    last = np.array([v.size - layout.length for v in records])
+    starts = np.minimum(np.rint(at), last[:, None]).astype(int)  # samples at which periods are cut
     late = starts - at
     raw = _transforms(records, starts, layout)
     power, mean, weight, gain = _compared(raw, late, layout)
@@ -314,15 +309,7 @@ def _deviations(
         low = _noise_of_single(gain[:, :, :single], weight[:, :single])
         sure = low > overall[:, 0] * (1 + SURE * math.sqrt(2 / ((single - 2) * (periods - 1))))
         noise[:, :single] = np.where(sure, low, overall[:, 0])[:, None]
-    return _Deviations(gain, weight, noise / weight, mean, late)
-
-
-def _starts(
-    records: Sequence[Float[np.ndarray, "_"]], at: Float[np.ndarray, "lane period"], layout: Bands
-) -> Int[np.ndarray, "lane period"]:
-    """The sample at which each period is cut."""
-    last = np.array([v.size - layout.length for v in records])
-    return np.minimum(np.rint(at), last[:, None]).astype(int)
+    return _Deviations(gain, weight, noise / weight, mean, late, raw)
 
 
 def _noise_of_single(gain: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """One fit of a circuit: elements, standard errors, verdict, and what else the data support."""
 
+import operator
 import os
 import statistics
 from collections.abc import Mapping
@@ -23,10 +24,7 @@ from etid.results.verdicts import RESULTS, Judged, counted, message
 from etid.signals.transfer import power
 
 CHANGES = 9  # changes that the score tests try: a spread, seven relaxations, a gain
-DOUBTFUL = ("misfit", "inconsistent", "max_steps_reached")  # wrong known elements cause them
-SEEN = 3.0  # standard deviations; below, the residual does not look like any of the changes
-SURE = 5.0  # standard deviations of a change of the circuit that is no chance
-_SLOW, _FAST = 2, 3  # number of relaxations at either end of the band
+_FAST = 3  # number of relaxations at the upper end of the band
 
 
 def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
@@ -107,14 +105,14 @@ class Support(eqx.Module):
         For one fit.
         """
         z = self._passive()
-        if z.max() < SEEN:
+        if z.max() < 3.0:
             return ""
         worst, last = int(np.argmax(z)), z.size - 1
         if worst == 0:
             what = "a spread of time constants that the circuit cannot make"
         elif worst == last:
             what = "another gain of v_out than of v_th"
-        elif worst <= _SLOW:
+        elif worst <= 2:
             what = "one more slow relaxation, a slow tail after each pulse"
         elif worst >= last - _FAST:
             what = (
@@ -132,7 +130,7 @@ class Support(eqx.Module):
         has: so do all of 16 drivers with 30 % more leakage inductance at 40 dB.
         """
         z = self._passive()
-        return bool(z.max() >= SURE and np.argmax(z) < z.size - 1 - _FAST)
+        return bool(z.max() >= 5.0 and np.argmax(z) < z.size - 1 - _FAST)
 
 
 class Limited(eqx.Module):
@@ -244,7 +242,7 @@ class Fit(Judged, HasSource[Circuit]):
         Raises:
             ValueError: The level is not between 0 and 1, or this is a batch.
         """
-        self._refuse_batch()
+        self.refuse_batch()
         z = statistics.NormalDist().inv_cdf(tails(level)[1])
         values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
         low, high = values - z * errors, values + z * errors
@@ -288,29 +286,25 @@ class Fit(Judged, HasSource[Circuit]):
         from etid.results.fits import Fits  # a table of this class
         from etid.results.fits_columns import described
 
-        self._refuse_batch()
+        self.refuse_batch()
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self)
         Fits(batch, described([{}]), np.array([self.note])).write(path)
 
-    def _refuse_batch(self) -> None:
+    def refuse_batch(self) -> None:
+        """Raise ValueError if this is a batch."""
         if np.ndim(self.rrse):
             raise ValueError("this is a batch of fits; take one of them, as in fits[0]")
 
     def _outside(self) -> np.ndarray:
         """A sentence on the elements that would lie outside their bounds, for each fit."""
-        if self.limits is None:
-            return np.full(np.shape(self.rrse), "")
-        units = self.circuit.units()
-        if not np.ndim(self.rrse):
-            return np.asarray(self.limits.text(units))
-        rows = range(len(self.rrse))
-        each = [jax.tree.map(lambda leaf, row=row: leaf[row], self.limits) for row in rows]
-        return np.array([one.text(units) for one in each], str)
+        units, shape = self.circuit.units(), np.shape(self.rrse)
+        each = [jax.tree.map(operator.itemgetter(row), self.limits) for row in np.ndindex(shape)]
+        return np.array([one.text(units) if one else "" for one in each], str).reshape(shape)
 
     @property
     def outside(self) -> str:
         """A sentence that names the elements that would lie outside their bounds; for one fit."""
-        self._refuse_batch()
+        self.refuse_batch()
         return str(self._outside())
 
     @property
@@ -330,15 +324,7 @@ class Fit(Judged, HasSource[Circuit]):
     @property
     def elements(self) -> tuple[str, ...]:
         """Each element as text, with standard error and unit; for one fit."""
-        return tuple(
-            f"{name} {quantity(float(value), unit, float(error))}"
-            for (name, unit), value, error in zip(
-                self.circuit.units().items(),
-                np.asarray(self.circuit.values()),
-                np.asarray(self.stderr.values()),
-                strict=True,
-            )
-        )
+        return tuple(" ".join(" ".join(row).split()) for row in self._rows())
 
     @property
     def changes(self) -> str:
@@ -361,12 +347,11 @@ class Fit(Judged, HasSource[Circuit]):
     @property
     def other_circuit(self) -> str:
         """A sentence if another circuit is a likelier cause of `inconsistent` than the driver."""
-        if self.verdict != "inconsistent" or self.support is None:
+        support = self.support
+        if self.verdict != "inconsistent" or support is None or not support.is_of_circuit():
             return ""
-        if not self.support.is_of_circuit():
-            return ""
-        looks = self.support.looks_like()
-        return f"{looks} Another circuit is the likelier cause: try circuit='auto' first."
+        likelier = "Another circuit is the likelier cause: try circuit='auto' first."
+        return f"{support.looks_like()} {likelier}"
 
     @property
     def note(self) -> str:
@@ -374,21 +359,29 @@ class Fit(Judged, HasSource[Circuit]):
         return " ".join(self._reasons)
 
     @property
+    def _told(self) -> tuple[str, str]:
+        """The method without what was told of elements, and a sentence that says it."""
+        return without_known(self.method, self.circuit.units())
+
+    @property
     def _reasons(self) -> list[str]:
         said = {"changed": "changes", "misfit": "missed", "out_of_bounds": "outside"}
         own = getattr(self, said.get(self.verdict, ""), "")
-        told = without_known(self.method, self.circuit.units())[1] and self.verdict in DOUBTFUL
-        doubt = "Is what was told right, and in SI units?" if told else ""
+        doubtful = self.verdict in ("misfit", "inconsistent", "max_steps_reached")
+        doubt = "Is what was told right, and in SI units?" if doubtful and self._told[1] else ""
         return [*filter(None, (self.other_circuit, message(self.verdict), own, doubt))]
+
+    def _rows(self) -> list[tuple[str, str, str]]:
+        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
+        return element_rows(self.circuit.units(), values, errors)
 
     def _overview(self) -> Overview:
         kind, verdict = type(self.circuit).__name__, self.verdict
-        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
-        rows = element_rows(self.circuit.units(), values, errors)
+        rows = self._rows()
         if np.ndim(self.rrse):
             batch = f"{kind} fits, batch of {np.shape(self.rrse)}: {counted(verdict)}"
             return Overview(batch, rows)
-        method, told = without_known(self.method, self.circuit.units())
+        method, told = self._told
         title = f"{kind}: {verdict} in {several(int(self.steps), 'step')} ({method})"
         title += f", {unexplained(float(self.rrse))}"
         if self.measured is None or self.measured.stderr is not None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of
 from etid.results.fit import Limited
 from etid.results.hdf5_table import Table, check_same_length
-from etid.results.verdicts import RESULTS, verdicts_of
+from etid.results.verdicts import verdicts_of
 
 SCHEMA = "etid/fits"
 VERSION = "1.4"
@@ -105,10 +105,10 @@ def columns_of(
             )
     real["change"] = np.stack([real.pop(name) for name in changes], axis=1)
     fields = real | {
-        "result": _verdicts(table, read["verdict"]),
+        "result": _read(verdicts_of, table, "verdict", read["verdict"]),
         "steps": read["steps"],
         "method": table.text("method"),
-        "remarks": _remarks(table, read["remarks"]),
+        "remarks": _read(np.vectorize(remarks_of, otypes=[int]), table, "remarks", read["remarks"]),
     }
     if "outside" in read:
         fields["limits"] = Limited(**{name: read[name].astype(float) for name in LIMITS})
@@ -123,10 +123,7 @@ def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[Abstract
         kind = circuit_class(stored, given)
     except LookupError as error:
         raise RecordingError(
-            f"is {reprlib.repr(stored)}",
-            file=table.name,
-            field="circuit",
-            remedy=str(error),
+            f"is {reprlib.repr(stored)}", file=table.name, field="circuit", remedy=str(error)
         ) from None
     parameters = table.attribute("parameters")
     names = parameters if isinstance(parameters, list) else [parameters]
@@ -140,25 +137,14 @@ def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[Abstract
     return kind
 
 
-def _verdicts(table: Table, names: np.ndarray) -> RESULTS:
+def _read(of: Callable[[np.ndarray], Any], table: Table, field: str, words: np.ndarray) -> Any:
+    """Verdicts or remarks of these words."""
     try:
-        return verdicts_of(names)
+        return of(words)
     except KeyError as error:
         raise RecordingError(
-            f"{error} is not a verdict of this version of etid",
+            f"{error} is not a verdict or a remark of this version of etid",
             file=table.name,
-            field="verdict",
-            remedy="Read it with the etid that wrote it",
-        ) from None
-
-
-def _remarks(table: Table, texts: np.ndarray) -> np.ndarray:
-    try:
-        return np.array([remarks_of(str(one)) for one in texts], int)
-    except ValueError as error:
-        raise RecordingError(
-            str(error),
-            file=table.name,
-            field="remarks",
+            field=field,
             remedy="Read it with the etid that wrote it",
         ) from None

@@ -84,11 +84,6 @@ class Instrument(eqx.Module):
                 raise ValueError(f"{part!r} is no number; write {name}=1e-3") from None
         return cls(**found)
 
-    @property
-    def states_errors(self) -> bool:
-        """Whether more than a drift is stated: what only maximum likelihood has."""
-        return bool(self.stored().keys() - {"drift"})
-
     def deviations(self, resistors: int) -> Float[Array, " error"]:
         """Standard deviations of gain, crosstalk, capacitance, and of each known resistor."""
         of_loads = self.gain, self.crosstalk, self.capacitance  # change loads directly

@@ -7,8 +7,6 @@ from typing import Any
 
 from etid.circuits.display import quantity
 
-KNOWN = "known_elements", "bounds"  # what was told of elements, in words of its own
-
 
 def options_of(method: str) -> tuple[str, dict[str, Any]]:
     """The name of a method and its options.
@@ -60,6 +58,7 @@ def without_known(method: str, units: Mapping[str, str]) -> tuple[str, str]:
             if 0 < end < math.inf
         ]
         told.append(f"{element} {' and '.join(said)} (bounds)")
-    rest = [f"{key}={value!r}" for key, value in options.items() if key not in KNOWN]
+    words = "known_elements", "bounds"
+    rest = [f"{key}={value!r}" for key, value in options.items() if key not in words]
     plain = f"{name}({', '.join(rest)})" if rest else name
     return plain, f"Told before the fit: {', '.join(told)}." if told else ""

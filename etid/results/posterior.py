@@ -2,17 +2,15 @@
 
 import dataclasses
 import statistics
-from typing import Generic, TypeVar
+from typing import Generic
 
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import Circuit
 from etid.circuits.display import between, quantity
 from etid.circuits.overview import Overview, Overviewed
 from etid.solvers.importance_sampling import effective
-
-Circuit = TypeVar("Circuit", bound=AbstractCircuit)
 
 
 def tails(level: float) -> tuple[float, float]:

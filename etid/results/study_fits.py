@@ -219,10 +219,7 @@ def _settings(table: Table) -> Settings | None:
         allowed = (int, float) if item_kind is float else item_kind
         if not all(isinstance(item, allowed) and not isinstance(item, bool) for item in items):
             raise RecordingError(
-                f"is {value!r}, must be {kind}",
-                file=table.name,
-                field=name,
-                remedy=REMEDY,
+                f"is {value!r}, must be {kind}", file=table.name, field=name, remedy=REMEDY
             )
         values[name] = tuple(items) if several else value
     return Settings(**values)

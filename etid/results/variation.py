@@ -24,9 +24,6 @@ from etid.recordings.fields import LABELS, check_names
 from etid.results.fits import Fits
 
 REST = "recordings"  # the last level: recordings with equal labels
-INTERVAL = 3.84  # increase of −2 ln L at the ends of a 95 % interval
-STEPS, SETTLED = 60, 1e-5  # of the search; the change of −2 ln L where it ends
-RIDGE = 1e-6  # added to the matrix, for deviations that are 0
 END = 1e-4  # relative error of the ends of an interval
 FINE = 1e-6  # of the spread of the logarithms; smaller deviations are 0
 
@@ -271,12 +268,12 @@ class _Model:
         free = np.arange(std.size) != fixed
         if fixed is not None:
             std[fixed] = start[fixed]
-        for _ in range(STEPS):
+        for _ in range(60):
             slope, matrix = self._derivatives(std)
             slope, matrix = slope[free], matrix[np.ix_(free, free)]
-            step = np.linalg.solve(matrix + RIDGE * np.eye(slope.size), -slope)
+            step = np.linalg.solve(matrix + 1e-6 * np.eye(slope.size), -slope)  # for std 0
             std[free] = np.maximum(std[free] * np.exp(np.clip(step, -2, 2)), FINE * self.spread)
-            if np.abs(step @ slope) < SETTLED:
+            if np.abs(step @ slope) < 1e-5:  # of the deviance
                 break
         return std, self.deviance(std)
 
@@ -314,7 +311,7 @@ class _Model:
         def beyond(std: float) -> float:
             start = best.copy()
             start[row] = std
-            return self.smallest(start, row)[1] - least - INTERVAL
+            return self.smallest(start, row)[1] - least - 3.84  # χ², 95 %
 
         at, low = float(best[row]), 0.0
         if beyond(0.0) > 0:

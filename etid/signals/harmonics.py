@@ -178,32 +178,6 @@ def signal_share(
     return jnp.clip(1 - noise / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
 
 
-def spectrum(
-    v_th: Float[Array | np.ndarray, " time"],
-    v_out: Float[Array | np.ndarray, " time"],
-    sigma_th: Float[Array | np.ndarray, ""],
-    sigma_out: Float[Array | np.ndarray, ""],
-    sample_rate: Float[Array | np.ndarray, ""],
-    periods: int,
-    samples: int,
-) -> tuple[Array | np.ndarray, ...]:
-    """Harmonics of both records and their noise: the fields of a `Spectrum`.
-
-    Args:
-        v_th: Unloaded voltage [V].
-        v_out: Loaded voltage [V].
-        sigma_th: Standard deviation of the white noise of a sample of `v_th` [V].
-        sigma_out: Standard deviation of the white noise of a sample of `v_out` [V].
-        sample_rate: Sampling rate [Hz].
-        periods: Number of periods from `whole_periods`.
-        samples: Number of samples from `whole_periods`.
-    """
-    both = namespace(v_out).stack([v_th[:samples], v_out[:samples]])
-    coefficients = harmonics(both, periods, samples)
-    sigma = namespace(v_out).stack([sigma_th, sigma_out])
-    return filled(coefficients, sigma, sample_rate, periods, samples)
-
-
 def filled(
     coefficients: Complex[Array | np.ndarray, "*recording 2 harmonic"],
     sigma: Float[Array | np.ndarray, "*recording 2"],
@@ -217,8 +191,14 @@ def filled(
     harmonics would lose more information at 24 to 40 dB than they disturb. Padded harmonics follow
     the last harmonic, up to a multiple of 64. They are not selected and almost zero; they give
     records of most lengths the same number of harmonics, so that compiled programs are shared.
-    Other arguments as in `spectrum`; several recordings of equal length share `frequency` and
-    `selected`.
+    Several recordings of equal length share `frequency` and `selected`.
+
+    Args:
+        coefficients: `harmonics` of the unloaded and of the loaded voltage [V].
+        sigma: Standard deviations of the white noise of their samples [V].
+        sample_rate: Sampling rate [Hz].
+        periods: Number of periods from `whole_periods`.
+        samples: Number of samples from `whole_periods`.
     """
     xp, count = namespace(coefficients), coefficients.shape[-1]
     number = np.arange(1.0, count + -count % 64 + 1)

@@ -18,6 +18,7 @@ and that about the elements and the delays, with Z_th projected out,
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -141,8 +142,9 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> B
         if key not in found:
             noise = _noise(scene, trial, f.size, waveform.sigma)
             current = _current_noise(scene, circuit, waveform) if measured else None
+            signals = _Signals(f, x, z_th, noise, current)
             found[key] = _covariance(
-                circuit, known, f, x, z_th, noise, current, delays, known_driver, scene.shared_v_th
+                circuit, known, signals, delays, known_driver, scene.shared_v_th
             )
         bounds[trial.path] = Bound(trial.path, circuit, found[key])
     return bounds
@@ -198,23 +200,34 @@ def _current_noise(scene: Scene, circuit: AbstractCircuit, waveform: Waveform) -
     return scene.current_noise(waveform.v_th / (load + waveform.z_th)) / waveform.sigma
 
 
+class _Signals(NamedTuple):
+    """What the records of a trial and of its calibrations contain.
+
+    Attributes:
+        f: Harmonics [Hz].
+        x: V_th at these, in standard deviations of a coefficient with white noise.
+        z_th: Source impedance [Ω].
+        noise: From `_noise`.
+        current: From `_current_noise`; None if the current is not recorded.
+    """
+
+    f: Float[np.ndarray, " f"]
+    x: Complex[np.ndarray, " f"]
+    z_th: Complex[np.ndarray, " f"]
+    noise: Float[np.ndarray, "row f"]
+    current: float | None
+
+
 def _covariance(
     circuit: AbstractCircuit,
     known: list[AbstractCircuit],
-    f: Float[np.ndarray, " f"],
-    x: Complex[np.ndarray, " f"],
-    z_th: Complex[np.ndarray, " f"],
-    noise: Float[np.ndarray, "row f"],
-    current: float | None,
+    signals: _Signals,
     delays: bool,
     known_driver: bool,
     shared_v_th: bool,
 ) -> Float[np.ndarray, "element element"]:
-    """Bound of the covariance of the elements' logarithms.
-
-    `x` is in standard deviations of a coefficient with white noise; `noise` is from `_noise`, and
-    `current` from `_current_noise`.
-    """
+    """Bound of the covariance of the elements' logarithms."""
+    f, x, z_th, noise, current = signals
     frequency, loads = jnp.asarray(f), [circuit, *known]
     z = [np.asarray(load.response(frequency)) for load in loads]
     slope = jax.jacfwd(lambda log: circuit.with_log_values(log).response(frequency))(

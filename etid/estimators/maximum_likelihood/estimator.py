@@ -133,7 +133,7 @@ class MaximumLikelihood(AbstractEstimator):
     ) -> Fit:
         """Refine from the best of several starts, jointly with the uncertain part of the driver."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
-        prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
+        prior = ElementPrior.of(self.known_elements, circuit)
         records = Records.of(spectrum)
         if isinstance(lane, HarmonicsWithCurrent) and not known.by_current:
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
@@ -146,7 +146,7 @@ class MaximumLikelihood(AbstractEstimator):
         found = load_fit.fit_circuit(load, starts)
         if known.shape is not None:
             found = found._replace(inconsistent=found.inconsistent | known.shape.differs(spectrum))
-        return found.judged(circuit, driver.result, str(self), self.bounds)
+        return found.judged(circuit, driver.result, str(self), self.bounds, prior)
 
     def describe(self) -> Description:
         """The text for a methods section."""

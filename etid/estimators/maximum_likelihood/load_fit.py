@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import judged, unless
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
@@ -55,10 +56,15 @@ class Found(NamedTuple):
     inconsistent: Bool[Array, ""]
 
     def judged(
-        self, circuit: AbstractCircuit, driver_result: RESULTS, method: str, bounds: Limits = ()
+        self,
+        circuit: AbstractCircuit,
+        driver_result: RESULTS,
+        method: str,
+        bounds: Limits = (),
+        prior: ElementPrior | None = None,
     ) -> Fit:
         """The fit with its verdict; for the arguments see `judgement.judged`."""
-        fit = judged(self.estimate, circuit, driver_result, method, bounds)
+        fit = judged(self.estimate, circuit, driver_result, method, bounds, prior)
         fit = unless(fit, self.inconsistent, RESULTS.inconsistent)
         return unless(unless(fit, self.far, RESULTS.driver_unclear), self.other, RESULTS.misfit)
 

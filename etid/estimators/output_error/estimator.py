@@ -99,11 +99,11 @@ class OutputError(AbstractEstimator):
         if isinstance(driver, MeasuredCurrent):
             m = _at_rest(m, samples)
         starts = circuit.with_log_values(_starts(m, driver, circuit))
-        prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
+        prior = ElementPrior.of(self.known_elements, circuit)
         fitted, estimate, other = fit.fit_circuit(
             prediction.prepare(m, samples=samples), driver, starts, prior
         )
-        found = judged(estimate, circuit, driver.result, str(self), self.bounds)
+        found = judged(estimate, circuit, driver.result, str(self), self.bounds, prior)
         limit = EDGES if isinstance(driver, MeasuredCurrent) else MISFIT_CHI2
         off = misses(estimate.chi2, estimate.rrse, INTERPOLATED, limit)
         if isinstance(driver, MeasuredCurrent):
