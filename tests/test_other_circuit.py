@@ -68,15 +68,10 @@ def scores(residual, rows, jacobian):
     q = jacobian.shape[0]
     covariance = np.linalg.inv(jacobian @ jacobian.T)
     ones = jnp.ones(residual.size)
-    return other_circuit.scores(
-        jnp.asarray(rows),
-        Linear(jnp.asarray(jacobian), ones, ones),
-        jnp.asarray(residual),
-        jnp.zeros(q),
-        jnp.zeros((q, q)),
-        jnp.asarray(covariance),
-        slice(q),
-    )
+    linear = Linear(jnp.asarray(jacobian), ones, ones)
+    without = jnp.zeros(q), jnp.zeros((q, q))
+    fitted = other_circuit.Fitted(*without, jnp.asarray(covariance), slice(q))
+    return other_circuit.scores(jnp.asarray(rows), linear, jnp.asarray(residual), fitted)
 
 
 NUMBER = {"spread": 0, "relaxation": 3}

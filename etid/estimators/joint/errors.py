@@ -271,16 +271,14 @@ def _scores(
         ]
     )
     spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
-    found = other_circuit.scores(
-        at.changes,
-        linear,
-        at.terms,
+    fitted = other_circuit.Fitted(
         # At the minimum the other terms have the opposite gradient.
         -linear.jacobian @ at.terms,
         spread.set(score - eliminated.rest.score) + linear.precision,
         covariance,
         slice(bread.shape[0], bread.shape[0] + own.log_elements.size),
     )
+    found = other_circuit.scores(at.changes, linear, at.terms, fitted)
     scale = jnp.asarray(False)
     if load.current is not None:
         found, of_current = (

@@ -86,28 +86,18 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     logs, late, z = load.gains.split(q)
     used = records.selected[0, every.index]
     moved = jnp.sqrt(jnp.max(jnp.where(used, power(load.gains.at(every).w(z)), 0.0)))
-    rest, spread = _priors(load, at)
+    fitted = _fitted(load, at, information)
     tested = changes(load, near)
     rows = condensed.rows(jnp.concatenate([by_layer(load, near), tested]))
-    found = _scores(load, near, linear, information, rows)
+    found = other_circuit.scores(rows, linear, condensed.part, fitted)
     outputs = load.gains.outputs
     of_layer, of_circuit, of_scales = (
         jax.tree.map(lambda leaf, which=which: leaf[which], found)
         for which in (0, slice(1, 1 - outputs or None), slice(-outputs, None))
     )
     other = other_circuit.Scores.of(of_circuit)
-    falling = falling_resistance.score(
-        by_falling(load, near),
-        profile,
-        share,
-        noise,
-        near.by_unknown(near.slopes),
-        every,
-        rest,
-        spread,
-        information,
-        count,
-    )
+    added = by_falling(load, near)
+    falling = falling_resistance.score(added, near, every, share, noise, fitted)
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
     of_gain = -outputs
     others = linear.told(rows[of_gain][None])[0] @ information
@@ -204,26 +194,18 @@ def scores_at(load: Load, q: Float[Array, " q"]) -> other_circuit.Scores:
     scales_of_currents = load.gains.outputs - 1
     tested = changes(load, near)
     rows = near.condensed.rows(tested[: len(tested) - scales_of_currents])
-    return other_circuit.Scores.of(_scores(load, near, linear, linear.bread(), rows))
+    fitted = _fitted(load, near.q, linear.bread())
+    return other_circuit.Scores.of(other_circuit.scores(rows, linear, near.condensed.part, fitted))
 
 
-def _scores(
-    load: Load,
-    near: Near,
-    linear: Linear,
-    information: Float[Array, "q q"],
-    rows: Float[Array, "change part"],
-) -> other_circuit.Score:
-    """Scores of the changes of the terms `rows`."""
-    part, priors, elements = near.condensed.part, _priors(load, near.q), slice(load.gains.elements)
-    return other_circuit.scores(rows, linear, part, *priors, information, elements)
-
-
-def _priors(load: Load, q: Float[Array, " q"]) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
-    """Gradient of the priors, and its covariance."""
+def _fitted(
+    load: Load, q: Float[Array, " q"], information: Float[Array, "q q"]
+) -> other_circuit.Fitted:
+    """The unknowns at q; `information` is the inverse of theirs."""
     precision, owned = 1 / load.gains.widths(q) ** 2, load.gains.owned
     spread = jax.scipy.linalg.block_diag(jnp.diag(precision[:owned]), load.gains.driver.cov)
-    return precision * (q - load.gains.centre(q)), spread
+    pull = precision * (q - load.gains.centre(q))
+    return other_circuit.Fitted(pull, spread, information, slice(load.gains.elements))
 
 
 def _linear(

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.estimators.maximum_likelihood.profile import Profile
+from etid.estimators.maximum_likelihood.condensed import Near
 from etid.estimators.score_tests import SEEN
-from etid.estimators.score_tests.other_circuit import MOVED
+from etid.estimators.score_tests.other_circuit import MOVED, Fitted
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, power, reciprocal
 
@@ -86,35 +86,31 @@ def added_voltage(
 
 def score(
     added: Complex[Array, "output harmonic"],
-    profile: Profile,
+    near: Near,
+    knots: Knots,
     share: Float[Array, " harmonic"],
     noise: Float[Array, "output harmonic"],
-    slopes: Complex[Array, "q output knot"],
-    knots: Knots,
-    rest: Float[Array, " q"],
-    spread: Float[Array, "q q"],
-    covariance: Float[Array, "q q"],
-    elements: int,
+    fitted: Fitted,
 ) -> Falling:
     """Score of a change of the outputs, `added` for each unit of ε.
 
     `share` is that of the signal in the power of X, `noise` the variances of the innovations
-    relative to those expected, `rest` the gradient of the priors and `spread` its covariance.
-    `slopes` are those of the gains at the knots, and the elements are the first parameters.
+    relative to those expected.
     """
+    profile, slopes = near.profile, near.by_unknown(near.slopes)
     weighted = profile.weighted(profile.whitened(added))
     parts = knots.summed(jnp.conj(weighted) * (profile.x * as_complex(share))[None, :]).ravel()
     rows = slopes.reshape(slopes.shape[0], -1)
-    others = (rows.real @ parts.real - rows.imag @ parts.imag) @ covariance
+    others = (rows.real @ parts.real - rows.imag @ parts.imag) @ fitted.covariance
     made = jax.lax.complex(others @ rows.real, others @ rows.imag).reshape(slopes.shape[1:])
     direction = added - profile.x[None, :] * knots.between(made)
-    total = jnp.sum((jnp.conj(direction) * profile.pull).real) + jnp.dot(others, rest)
-    of_priors = others @ spread @ others
+    total = jnp.sum((jnp.conj(direction) * profile.pull).real) + jnp.dot(others, fitted.pull)
+    of_priors = others @ fitted.spread @ others
     squares = profile.weight * power(profile.whitened(direction))
     variance = jnp.sum(squares * noise) + of_priors
     curvature = jnp.sum(squares * share[None, :]) + of_priors
     return Falling(
         total / jnp.sqrt(variance),
-        jnp.abs(total) / curvature * jnp.max(jnp.abs(others[:elements])),
+        jnp.abs(total) / curvature * jnp.max(jnp.abs(others[fitted.elements])),
         total**2 / curvature,
     )

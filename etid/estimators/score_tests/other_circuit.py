@@ -225,14 +225,27 @@ class Scores(NamedTuple):
         return likely & ~proven, jnp.where(proven, 0.0, cov)
 
 
+class Fitted(NamedTuple):
+    """The parameters of a fit, as scores of further ones see them.
+
+    Attributes:
+        pull: Gradient of the priors.
+        spread: Covariance of this gradient.
+        covariance: Inverse of the information, including that of other terms.
+        elements: Slice of the parameters that are the logarithms of the elements.
+    """
+
+    pull: Float[Array, " q"]
+    spread: Float[Array, "q q"]
+    covariance: Float[Array, "q q"]
+    elements: slice
+
+
 def scores(
     rows: Float[Array, "change term"],
     linear: Linear,
     residual: Float[Array, " term"],
-    rest: Float[Array, " q"],
-    spread: Float[Array, "q q"],
-    covariance: Float[Array, "q q"],
-    elements: slice,
+    fitted: Fitted,
 ) -> Score:
     """Score of each change.
 
@@ -243,21 +256,18 @@ def scores(
         rows: Derivatives of the residual with respect to ε.
         linear: The terms, linear in the parameters.
         residual: Residual [standard deviations].
-        rest: Gradient of the priors.
-        spread: Covariance of this gradient.
-        covariance: Inverse of the information, including that of other terms.
-        elements: Slice of the parameters that are the logarithms of the elements.
+        fitted: The parameters.
     """
-    directions, others = linear.projected(rows, covariance)
-    score = directions @ residual - others @ rest
+    directions, others = linear.projected(rows, fitted.covariance)
+    score = directions @ residual - others @ fitted.pull
     # Matrix products take a fifth of the time of sums.
-    of_priors = jnp.sum((others @ spread) * others, axis=1)
+    of_priors = jnp.sum((others @ fitted.spread) * others, axis=1)
     variance, curvature = (
         directions**2 @ jnp.stack([linear.noise, linear.share], axis=1)
     ).T + of_priors[None]
     can = curvature <= NOTHING * (rows**2 @ linear.share)
     size = score / curvature
-    slope = -others[:, elements]
+    slope = -others[:, fitted.elements]
     moved = jnp.abs(size) * jnp.max(jnp.abs(slope), axis=1)
     deviation = jnp.sqrt(variance)
     z = jnp.where(can, jnp.nan, score / deviation)

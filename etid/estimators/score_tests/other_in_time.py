@@ -49,7 +49,7 @@ from etid.estimators.output_error.prediction import (
 )
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import SEEN
-from etid.estimators.score_tests.other_circuit import Score, relaxations, scores
+from etid.estimators.score_tests.other_circuit import Fitted, Score, relaxations, scores
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance
 from etid.results.feed import CurrentSource
@@ -234,16 +234,10 @@ def score(
     by_change, by_parameter = scaled[:count], scaled[count:]
     ones = jnp.ones(scaled.shape[1])
     linear = Linear(by_parameter, ones, ones, jnp.diag(jnp.sqrt(known)))
-    return scores(
-        by_change,
-        linear,
-        terms(residual),
-        rest,
-        jnp.diag(known),
-        # A parameter that the record does not determine, such as an initial state, has no effect.
-        inverse(linear.curvature().expected, drop=True),
-        slice(elements),
-    )
+    # A parameter that the record does not determine, such as an initial state, has no effect.
+    covariance = inverse(linear.curvature().expected, drop=True)
+    fitted = Fitted(rest, jnp.diag(known), covariance, slice(elements))
+    return scores(by_change, linear, terms(residual), fitted)
 
 
 class Shown(NamedTuple):
