@@ -69,7 +69,7 @@ OPTIONS = (
     option("--snr", default=(60.0, 40.0), help="dB"),
     option("--hazard-electrodes", default=96),
     option("--hazard-pulses", default=5210),
-    option("-o", "--output", default=RESULTS / "control.svg"),
+    option("-o", "--output", default=RESULTS / "control", help="of the .csv and the .svg"),
 )
 
 
@@ -89,7 +89,7 @@ def main(arguments: argparse.Namespace) -> bool:
             print(f"{snr:g} dB  {name:<20}{run.text(fingertip.counts)}", flush=True)
         asked += found["etid"].targets(fingertip.counts, f"{snr:g} dB: ")
         runs |= {f"{name}, {snr:g} dB": run for name, run in found.items()}
-    draw(runs, fingertip, arguments.output)
+    draw(runs, fingertip, arguments.output.with_suffix(".svg"))
     return report(asked)
 
 

@@ -34,7 +34,7 @@ CASES = {
     "amplitude_errors": ("--draws 2", "", "scene 0: covered"),
     "amplitudes": ("", "", "error of harmonic balance"),
     "control": (
-        f"--electrodes 4 --pulses 4 --snr 60 {HAZARDS} --output {{}}/control.svg",
+        f"--electrodes 4 --pulses 4 --snr 60 {HAZARDS} --output {{}}/control.csv",
         "control.svg control.csv", "above the cap but the first after an unseen change  0",
     ),
     "coverage": ("--repetitions 3 --parts 0.03", "", "dry, default: covered"),
