@@ -36,6 +36,18 @@ COPIED = (
     *("conda", ".ci"),
     ".pytest_cache",  # what was compiled for tests without a mutant
 )
+NOTED = "coverage.ini"
+# The command, the live view and workers run in child processes, which end by `os._exit` as well.
+CHILDREN_TOO = """\
+[run]
+source = {source}
+data_file = {beside}/lines
+parallel = true
+sigterm = true
+patch =
+    subprocess
+    _exit
+"""
 LIMIT = 600.0  # [s] of a mutant; one that takes longer counts as a survivor
 # To load these takes longer than most mutants live: a process that has loaded them is forked.
 PRELOADED = (
@@ -80,13 +92,15 @@ def _run(folder: str, tests: Sequence[str], module: str, answer: Connection) -> 
     import coverage
     import pytest
 
-    failed, noted = _Failed(), coverage.Coverage(data_file=None, source=[f"{folder}/etid"])
+    failed, noted = _Failed(), coverage.Coverage(config_file=str(beside / NOTED))
     # Modules of plugins are loaded already, and their assertions are not rewritten.
     options = ["-q", "-x", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
     if module:  # to check the types of all modules takes longer than to load them
         options.append(f"--jaxtyping-packages={module},beartype.beartype")
     with contextlib.nullcontext() if module else noted.collect():
         status = pytest.main([*options, *tests], plugins=[failed])
+    if not module:
+        noted.combine()  # with what child processes have left
     data = noted.get_data()
     lines = {os.path.relpath(path, folder): data.lines(path) for path in data.measured_files()}
     # A file whose tests are all slow, or need what is not there, has nothing against it.
@@ -111,6 +125,7 @@ class Tree:
                 shutil.copytree(path, self.folder / path.name, ignore=ignored)
         if (root.parent / "shared").exists():  # reference data
             (beside / "shared").symlink_to((root.parent / "shared").resolve())
+        (beside / NOTED).write_text(CHILDREN_TOO.format(source=self.folder / "etid", beside=beside))
         self.context = multiprocessing.get_context("forkserver")
         self.context.set_forkserver_preload(list(PRELOADED))
         self.times = 0
@@ -133,6 +148,8 @@ class Tree:
     def executed(self, test: str) -> tuple[float, Mapping[str, Sequence[int]]]:
         """How long a file of tests takes [s], and the lines of etid that it executes."""
         begun = time.perf_counter()
+        for left in self.folder.parent.glob("lines*"):
+            left.unlink()  # of a child process that was killed late
         found = self.judged([test], "", 10 * LIMIT)
         if not found.passed:
             raise SystemExit(f"{test} fails without any mutant: {found.killer}")

@@ -1,24 +1,42 @@
-"""The public plots of things made by hand, to be compared with images; makes these images anew.
+"""The public plots of things made by hand, and what is in them; writes this anew.
 
     python -m tests.pictures
 
-writes `tests/baseline/NAME.png`. Look at each before it is committed.
+writes `tests/baseline/pictures.json`, which is compared, and `tests/baseline/NAME.png`, which the
+guide shows. Look at each before it is committed.
 """
 
 import dataclasses
 import functools
 import itertools
+import json
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
+import pytest
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.collections import Collection
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.path import Path
+from matplotlib.spines import Spine
+from matplotlib.text import Text
 
 import etid
 from etid.plotting import figure_of
+from etid.plotting.layout import FINGERTIP
+from etid.report import figures, tables
+from etid.report.tables import Components
 from etid.results.driver import Calibration, ContinuousDriver, Driver, SourceImpedance
 from etid.results.fit import CHANGES, Fit, Support
 from etid.results.fits import Fits
@@ -27,7 +45,7 @@ from etid.selection.search import usual_circuits
 from etid.simulation.scenes import PRESETS, Trial
 
 BASELINE = pathlib.Path(__file__).parent / "baseline"
-DPI = 60
+DESCRIBED = BASELINE / "pictures.json"
 SKIN = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
 RELATIVE = np.array([0.02, 0.005, 0.03])  # standard errors of SKIN
 SPREAD = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.85)
@@ -146,6 +164,34 @@ def fits() -> Fits:
     )
 
 
+def display() -> Fits:
+    """Three fits of each of two days at electrodes of a display; the last of each is no success."""
+    found = fits().take(np.array([0, 2, 1] * 2))
+    names = np.array(["E1", "E8", "E98", "E1", "E9", "E98"], object)
+    days = np.array(["d1"] * 3 + ["d2"] * 3, object)
+    return dataclasses.replace(found, labels={**found.labels, "electrode": names, "session": days})
+
+
+def nothing_found() -> etid.Selection:
+    """A choice for a recording that no candidate can be fitted to."""
+    nothing = SKIN.with_log_values(jnp.full(3, jnp.nan))
+    one = dataclasses.replace(fit("too_short", nothing), support=selection().fit.support)
+    return etid.Selection.of({0: one}, 0, usual_circuits())
+
+
+def narrow(*of: Any) -> Figure:
+    """A picture as wide as the column of a paper."""
+    figure = etid.plot(*of, size=(3.3, 6.0))[0].figure
+    plt.close(figure)
+    return figure
+
+
+def components() -> tuple[list[Components], list[str]]:
+    """Variations of the elements, and the conditions."""
+    of = fits()
+    return tables.components(of, of.summary("subject", "condition")), tables.frequent(of, 4)
+
+
 def bounds() -> dict[str, etid.Bound]:
     """Of a dry trial at 60 dB, and one whose capacitance is not determined."""
     one = etid.bound(PRESETS["paper_dry"](snr_db=60.0))["typical/dry/01"]
@@ -207,6 +253,73 @@ def faults(figure: Figure) -> list[str]:
     return found
 
 
+# What of an artist is compared: what it shows and how, but no places that depend on letters.
+SHOWN = (
+    *("label", "text", "color", "facecolor", "edgecolor", "linestyle", "linewidth", "marker"),
+    *("markersize", "markerfacecolor", "alpha", "zorder", "visible", "xlim", "ylim", "xscale"),
+    *("yscale", "xlabel", "ylabel", "xdata", "ydata", "xy", "width", "height", "position"),
+    *("paths", "offsets", "array", "clim", "fontsize", "rotation", "frame_on"),
+    *("horizontalalignment", "verticalalignment"),
+)
+
+
+def artists(of: Artist) -> Iterator[Artist]:
+    """All that is drawn, without ticks and spines."""
+    for one in of.get_children():
+        if not isinstance(one, Axis | Spine) and one is not getattr(of, "patch", None):
+            yield one
+            yield from artists(one)
+
+
+def simple(value: Any) -> Any:
+    """Something that JSON knows; many numbers as their mean, size, ends and limits."""
+    if value is None or isinstance(value, str | bool):
+        return value
+    if isinstance(value, list) and value and isinstance(value[0], Path):
+        value = np.concatenate([one.vertices for one in value])
+    try:
+        numbers = np.ma.filled(np.ma.asarray(value, float), np.nan).ravel()
+    except (TypeError, ValueError):
+        return str(value)
+    known = numbers[np.isfinite(numbers)]
+    if numbers.size > 8 and known.size:
+        size = np.sqrt(np.mean(known**2))
+        ends = known[0], known[-1], known.min(), known.max()
+        numbers = np.array([known.mean(), size, *ends])
+    return [float(f"{one:.6g}") if np.isfinite(one) else str(one) for one in numbers.tolist()]
+
+
+def described(figure: Figure) -> list[dict[str, Any]]:
+    """What is in a picture, by `SHOWN`; of axes also what they share and the names of ticks."""
+    found = []
+    for one in artists(figure):
+        if not isinstance(one, Axes | Collection | Legend | Line2D | Patch | Text):
+            continue
+        shown: dict[str, Any] = {"kind": type(one).__name__}
+        for name in SHOWN:
+            if hasattr(one, f"get_{name}"):
+                shown[name] = simple(getattr(one, f"get_{name}")())
+        if isinstance(one, Axes):
+            formatters = [axis.get_major_formatter() for axis in (one.xaxis, one.yaxis)]
+            shown["position"] = None  # the letters beside it have their room
+            shown["ticks"] = [[*getattr(of, "seq", ())] for of in formatters]
+            shown["labelled"] = one.xaxis.get_tick_params().get("labelbottom", True)
+            shown["shared"] = len(one.get_shared_x_axes().get_siblings(one))
+        shown["hidden"] = not shown.pop("visible")
+        if shown.get("text") != "":
+            found.append({name: of for name, of in shown.items() if of not in (None, "", False)})
+    return found
+
+
+def of_report(call: Callable[..., bytes], *arguments: Any) -> Figure:
+    """The figure that a function of a report draws."""
+    drawn: list[Figure] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "svg", lambda figure: drawn.append(figure) or b"")
+        call(*arguments)
+    return drawn[0]
+
+
 PICTURES: dict[str, Callable[[], Figure]] = {
     "recording": lambda: figure_of(dry()),
     "recording_with_current": lambda: figure_of(with_current()),
@@ -225,18 +338,36 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "posterior": lambda: figure_of(posterior()),
     "profile": lambda: figure_of(profile()),
     "bound": lambda: figure_of(bounds()),
+    "map": lambda: figure_of(display(), map="r_p"),
+    "selection_without_elements": lambda: figure_of(nothing_found(), spread(), driver()),
+    "selection_for_a_column": lambda: narrow(selection(), spread(), driver()),
+    "report_distributions": lambda: of_report(figures.distributions, fits()),
+    "report_subjects": lambda: of_report(figures.by_subject, fits()),
+    "report_quality": lambda: of_report(
+        figures.quality, *np.geomspace(0.9, 9.0, 40).reshape(2, 20)
+    ),
+    "report_components": lambda: of_report(figures.components, *components()),
+    "report_fits": lambda: of_report(figures.each_fit, fits()),
+    "report_electrodes": lambda: of_report(figures.electrodes, display(), "c_p", FINGERTIP),
+    "report_drivers": lambda: of_report(figures.drivers, {"98k8": driver()}),
 }
 
 
-def draw(name: str, path: pathlib.Path) -> None:
-    """Write one picture as it is compared."""
+def drawn(name: str) -> Figure:
+    """One picture as it is compared."""
     with mpl.rc_context():
         mpl.rcdefaults()
-        PICTURES[name]().savefig(path, dpi=DPI, metadata={"Software": None})
+        return PICTURES[name]()
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    BASELINE.mkdir(exist_ok=True)
+    every = {}
     for picture in PICTURES:
-        draw(picture, BASELINE / f"{picture}.png")
+        figure = drawn(picture)
+        every[picture] = described(figure)
+        figure.savefig(BASELINE / f"{picture}.png", dpi=60, metadata={"Software": None})
+    rows = (
+        f'"{name}": [\n' + ",\n".join(map(json.dumps, of)) + "\n]" for name, of in every.items()
+    )
+    DESCRIBED.write_text("{\n" + ",\n".join(rows) + "\n}\n")

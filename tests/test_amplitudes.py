@@ -17,6 +17,7 @@ from scipy.special import erf
 import etid
 from benchmarks import amplitudes as amplitudes_benchmark
 from etid.circuits.current_dependent import Norton, Signals, port
+from etid.estimators.amplitudes.fit import _equations
 from etid.estimators.amplitudes.terms import Amplitudes, with_filter
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.identify.amplitudes import leaves_much
@@ -196,6 +197,15 @@ def test_terms_and_their_slopes_agree_with_steps_in_time():
     np.testing.assert_allclose(found, np.concatenate([off.real, off.imag], axis=1), atol=1e-12)
     away = np.array([0.0, 0.0, 0.0, np.log(truth[3] / 0.585e-3) / 5, *(delays / 0.5), *filters])
     np.testing.assert_allclose(of.priors(q), away, atol=1e-12)
+    found = tiers.program(lambda q: _equations(None, q, of))(q)
+    part, rows = np.asarray(of.scaled(jnp.asarray(predicted))), 5 * used[:, None] * slopes
+    rows = np.concatenate([rows.real, rows.imag], axis=2)
+    prior = 1 / np.asarray(of.widths(q))
+    np.testing.assert_allclose(found.objective, 0.5 * (np.sum(part**2) + np.sum(away**2)))
+    gradient, size = prior * away - np.einsum("rqt,rt->q", rows, part), np.abs(rows).max()
+    np.testing.assert_allclose(found.gradient, gradient, atol=1e-9 * size)
+    matrix = np.diag(prior**2) + np.einsum("rqt,rpt->qp", rows, rows)
+    np.testing.assert_allclose(found.matrix, matrix, rtol=1e-9, atol=1e-12 * size**2)
 
 
 @pytest.mark.slow

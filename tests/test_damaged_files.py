@@ -263,6 +263,7 @@ def test_matlab_that_declares_a_huge_shape_is_refused_at_once(kinds, tmp_path):
         (145, 0x08, "without its numbers"),  # says that it is complex: of what follows
         (144, 5, "without its numbers"),  # says that it is sparse: the same
         (176, 8, "of type 8, which does not exist"),
+        (178, 5, "has a short element of 5 bytes"),  # it has room for four
     ],
 )
 def test_a_damaged_matlab_5_is_refused_before_scipy_ends_the_process(

@@ -66,6 +66,15 @@ def contents(study):
 # reading
 
 
+def test_without_a_conversion_and_an_offset_samples_are_in_their_unit(edit):
+    def forget(file):
+        for name in ("conversion", "offset"):
+            del file[f"{DAMP}/v_out"].attrs[name]
+
+    with hdf5.read(edit(forget)) as study:
+        np.testing.assert_array_equal(study[DAMP].v_out, CODES[1])
+
+
 def test_a_file_with_more_than_the_schema_knows_is_read_in_order_of_its_paths(edit):
     def annotate(file):
         file.attrs.update(laboratory="ours", schema_version="1.17")

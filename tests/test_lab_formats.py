@@ -1,5 +1,6 @@
 """WAV, LabVIEW, Excel and npz files, arrays, and one long record that holds several trials."""
 
+import struct
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,27 @@ def test_a_wav_file_holds_fractions_of_full_scale(kind, tmp_path):
     np.testing.assert_allclose(recording.v_out, out, atol=100 / full if full > 1 else 1e-5)
 
 
+@pytest.mark.parametrize("missing", [0, 4])
+def test_a_wav_file_of_more_than_4_gb_says_its_length_elsewhere(missing, tmp_path):
+    """As RF64 (EBU Tech 3306): lengths of 64 bits stand before the samples; here of a short one."""
+    th, out = pulses()
+    codes = np.stack([32 * th, 32 * out], axis=1).astype("<i2").tobytes()
+    path, unknown = tmp_path / "a.wav", 2**32 - 1
+    path.write_bytes(
+        struct.pack("<4sI4s", b"RF64", unknown, b"WAVE")
+        + struct.pack("<4sIQQQI", b"ds64", 28, 72 + len(codes), len(codes), len(th), 0)
+        + struct.pack("<4sIHHIIHH", b"fmt ", 16, 1, 2, int(RATE), 4 * int(RATE), 4, 16)
+        + struct.pack("<4sI", b"data", unknown)
+        + codes[: len(codes) - missing]
+    )
+    names = {**FIELDS, "v_th": "1", "v_out": "2", "scale": 2**-10}
+    if missing:
+        refused(path, None, "is truncated: its samples end at byte", **names)
+    else:
+        [recording], _ = imported(path, **names)
+        np.testing.assert_array_equal(recording.v_out, out)
+
+
 def virtual(path, times=None, step=1 / RATE, **said):
     """A LabVIEW file of pulses."""
     times = [f"{i / RATE:.6f}" for i in range(2000)] if times is None else times
@@ -96,6 +118,15 @@ def test_a_labview_file_says_how_it_is_written(separator, decimal, columns, tmp_
 def test_a_labview_file_that_contradicts_itself_is_refused(said, message, tmp_path):
     names = {**NAMES, "v_th": said.get("name", "open")}
     assert refused(virtual(tmp_path, **said), None, message, **names, **FIELDS).remedy
+
+
+def test_a_labview_file_without_times_and_intervals_needs_a_sample_rate(tmp_path):
+    path = virtual(tmp_path, [""] * 2000)
+    text = path.read_text()
+    path.write_text("\n".join(one for one in text.split("\n") if not one.startswith("Delta_X")))
+    told = {name: of for name, of in FIELDS.items() if name != "sample_rate"}
+    refused(path, None, "sample_rate", **NAMES, **told)
+    assert imported(path, **NAMES, sample_rate=RATE)[0][0].sample_rate == RATE
 
 
 def test_a_labview_file_may_have_coarse_times_more_samples_and_a_cut_end(tmp_path):

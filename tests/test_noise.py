@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from etid.signals.noise import noise_std, shows_few
+from etid.signals.noise import WINDOW, _around, noise_std, shows_few
 
 
 def test_white_noise_on_a_pulse_is_unbiased():
@@ -38,3 +38,10 @@ def test_infinite_samples_are_one_value_of_a_converter():
     """Warnings are errors: the difference of two infinite samples would be one."""
     assert shows_few(np.full(4096, np.inf))
     assert not shows_few(np.append(np.arange(4094.0), [np.inf, np.inf]))
+
+
+@pytest.mark.parametrize("size", [WINDOW // 2, 5 * WINDOW])
+def test_sums_around_a_harmonic_are_those_of_its_neighbours(size):
+    values = np.random.default_rng(3).normal(size=(2, size))
+    near = abs(np.subtract.outer(np.arange(size), np.arange(size))) <= WINDOW // 2
+    np.testing.assert_allclose(_around(values), values @ near, atol=1e-12 * size)

@@ -13,7 +13,7 @@ from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.circuits.elements import resistor
 from etid.estimators.estimate import DELAY_WIDTH, KNOWN_DELAY, SOLVER, delay_std
 from etid.estimators.lanes import PaddedSamples
-from etid.estimators.output_error.estimator import _has_aliases
+from etid.estimators.output_error.estimator import _has_aliases, _leaves_out
 from etid.estimators.output_error.fit import fit_source
 from etid.estimators.output_error.information import (
     Slopes,
@@ -234,6 +234,20 @@ def test_errors_of_a_driver_that_misses_its_calibration_are_as_large_as_it_does(
     assert float(chi2) > 5
     np.testing.assert_allclose(larger / chi2, 4, rtol=1e-2)
     np.testing.assert_allclose(np.diagonal(same), np.diagonal(cov), rtol=0.05)
+
+
+@pytest.mark.parametrize("v_out_per_v_th", [1.0, 0.01])
+def test_what_the_interpolation_leaves_out_is_hidden_by_noise_as_stated(v_out_per_v_th):
+    """A sinusoid of 1 % at 0.48 of the rate: its RMS is 1 %, a thirtieth of which is left out."""
+    count = 4000
+    time = np.arange(count)
+    low = np.sin(2 * np.pi * 0.01 * time)
+    v_th, v_out = low + 0.01 * np.sin(2 * np.pi * 0.48 * time), v_out_per_v_th * low
+    # 15 σ / RMS(V_out) / √N is as large where σ of V_out is this.
+    limit = 0.01 / 30 / 15 * np.sqrt(count / 2) * v_out_per_v_th
+    for part in (0.9, 1.1):
+        of = map(jnp.asarray, (v_th, v_out, 1e-9, part * limit, 200e3))
+        assert bool(_leaves_out(Measurement(*of), jnp.asarray(count))) == (part < 1)
 
 
 @pytest.mark.slow

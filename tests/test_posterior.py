@@ -11,7 +11,7 @@ import pytest
 
 import etid
 from benchmarks.ladder import LOADS
-from etid.identify.posterior import inside, stretched
+from etid.identify.posterior import Impedances, inside, stretched
 from etid.results.posterior import Profile
 from etid.solvers.importance_sampling import drawn, effective
 
@@ -65,6 +65,17 @@ def test_what_bounds_tell_of_the_elements_moves_the_others_as_their_covariance_s
     np.testing.assert_allclose(centre, [*logs, *(mean[3:] + slope @ (logs - mean[:3]))], rtol=1e-9)
     np.testing.assert_allclose(found[:3, :3], told, rtol=1e-9)
     np.testing.assert_allclose(found[3:, 3:], alone + slope @ told @ slope.T, rtol=1e-9)
+
+
+def test_moments_of_impedances_are_to_first_order_those_of_logarithms():
+    """Of a resistance, of a capacitance, whose impedance falls with it, and of no impedance."""
+    of = Impedances(np.array([0.3, -0.2, 0.5]), np.array([1.0, -1.0, 0.0]))
+    mean, root = np.array([0.5, 0.4, -0.1]), np.random.default_rng(1).normal(size=(3, 3))
+    at, cov = of.moments(mean, root @ root.T)
+    np.testing.assert_allclose(at, [np.exp(0.2), np.exp(-0.6), -0.1])
+    np.testing.assert_allclose(of.logs(at[None])[0], mean)
+    slopes = [(of.of(mean + step) - of.of(mean - step)) / 2e-5 for step in 1e-5 * np.eye(3)]
+    np.testing.assert_allclose(cov, np.transpose(slopes) @ (root @ root.T) @ slopes, rtol=1e-8)
 
 
 def test_draws_are_stretched_to_the_covariance_of_the_fit():

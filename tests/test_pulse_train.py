@@ -8,7 +8,7 @@ import etid
 from etid.identify.planning import explained
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
-from etid.signals.pulse_train import fast_length, find_pulses
+from etid.signals.pulse_train import clocks_apart, fast_length, find_pulses
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import SkinLoad
 
@@ -89,6 +89,30 @@ def test_two_records_with_different_clocks_are_a_mismatch(sample_rate, ppm, snr_
 def test_a_record_that_begins_close_to_an_edge_has_one_clock(sample_rate, before):
     record = simulate(sample_rate, snr_db=60.0, start=1.2e-4 - before)
     assert preflight(Inspected(record)) is None
+
+
+def test_the_drift_is_from_the_first_pulse_to_the_last():
+    """Also in a record that begins long before a pulse."""
+    one, other = (
+        simulate(200e3, 6.0, pulse_rate_ppm=of, snr_db=80.0, start=-15e-3) for of in (0.0, 100.0)
+    )
+    train = find_pulses(one.v_th, 200e3, PULSE)
+    first, last = train.edges[[0, -1]]
+    assert first > 2500
+    records, sigma = np.stack([one.v_th, other.v_out])[None], np.full((1, 2), 1e-3)
+    [drift] = clocks_apart(records, sigma, [train], [0.0])
+    # Its sign is that of a later pulse. A slower clock by 0.01 % of its own is 0.01 % of this.
+    assert abs(drift) == pytest.approx(1e-4 * (last - first), rel=0.03)
+
+
+@pytest.mark.parametrize(("uneven", "even"), [(0.02, True), (0.1, False)])
+def test_pulses_have_one_rate_if_their_distances_are_equal_to_a_twentieth(uneven, even):
+    v = np.zeros(20_000)
+    for number, start in enumerate(1000 + 3333 * np.arange(5)):
+        late = round(0.5 * uneven * 3333) * (number % 2)  # every other distance is longer
+        v[start + late : start + late + 60] = 50.0
+    v += np.random.default_rng(0).normal(scale=1e-3, size=v.size)
+    assert (find_pulses(v, 200e3, PULSE).spacing is not None) == even
 
 
 def test_a_disturbed_period_is_no_drift():

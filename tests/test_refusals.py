@@ -88,6 +88,7 @@ dataclasses.replace(of.fit, method='output_error').posterior(of.skin, of.driver)
     -> method='maximum_likelihood'
 of.fit.profile('cp') -> 'cp' is no element of SkinRC
 of.fit.posterior(draws=0) -> at least 1
+of.batch.posterior(of.skin, of.driver) -> take one of them
 dataclasses.replace(of.fit, cov=np.full((3, 3), np.nan)).posterior(of.skin, of.driver)
     -> does not determine
 dataclasses.replace(of.fit).posterior() -> fit\.posterior\(recording, driver\)

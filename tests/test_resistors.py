@@ -22,7 +22,9 @@ def calibrations():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "method"), [(1.0, None), (1.05, None), (1.05, "output_error")])
+@pytest.mark.parametrize(
+    ("factor", "method"), [(1.0, None), (1.05, None), (0.95, None), (1.05, "output_error")]
+)
 def test_of_two_resistors_one_that_is_5_percent_wrong_is_seen(calibrations, factor, method):
     """It made every element wrong by 2 to 4 %, at chi2 5 or 1.5."""
     first, second = calibrations

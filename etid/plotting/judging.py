@@ -170,7 +170,8 @@ def draw_selection(
     chosen = selection.candidates[0]
     fitted = [one for one in selection.candidates if listed(one.fit)]
     if chosen not in fitted:
-        without_elements(axes[0])
+        for axis in axes:
+            without_elements(axis)
         judged(axes[0], recording.path, selection.fit)
         return axes
     recording, known = _in_bands(recording, driver)
