@@ -208,6 +208,16 @@ def test_terms_and_their_slopes_agree_with_steps_in_time():
     np.testing.assert_allclose(found.matrix, matrix, rtol=1e-9, atol=1e-12 * size**2)
 
 
+def test_two_amplitudes_tell_the_elements_and_their_fall():
+    truth, rng = np.array([895.0, 60.1e3, SLOWER * 1e-9, 0.585e-3]), np.random.default_rng(1)
+    exact = [(stepped(one, AT), one * pulses(AT)) for one in (0.5e-3, 5e-3)]
+    fit = etid.identify_amplitudes([recorded(*one, 1e-3, rng) for one in exact])
+    error = np.asarray(fit.circuit.values()) - truth
+    assert np.abs(error / truth).max() < 0.02
+    # Chi-squared with four degrees of freedom, exceeded once in ten thousand times.
+    assert error @ np.linalg.solve(fit.cov, error) < scipy.stats.chi2.ppf(0.9999, 4)
+
+
 @pytest.mark.slow
 def test_elements_and_errors_are_right_at_any_amplitudes(compiled):
     """At 1, 3 and 5 mA the resistance is far below R_p in every record."""

@@ -70,8 +70,9 @@ def test_a_wav_file_of_more_than_4_gb_says_its_length_elsewhere(missing, tmp_pat
     path, unknown = tmp_path / "a.wav", 2**32 - 1
     path.write_bytes(
         struct.pack("<4sI4s", b"RF64", unknown, b"WAVE")
-        + struct.pack("<4sIQQQI", b"ds64", 28, 72 + len(codes), len(codes), len(th), 0)
+        + struct.pack("<4sIQQQI", b"ds64", 28, 86 + len(codes), len(codes), len(th), 0)
         + struct.pack("<4sIHHIIHH", b"fmt ", 16, 1, 2, int(RATE), 4 * int(RATE), 4, 16)
+        + struct.pack("<4sI6s", b"note", 5, b"odd")  # a filling byte is not counted
         + struct.pack("<4sI", b"data", unknown)
         + codes[: len(codes) - missing]
     )

@@ -171,6 +171,19 @@ def test_skin_that_is_not_one_rc_is_refused_within_two_pulses(make):
     assert (found[SOON - 1 :] == "misfit").all()
 
 
+turned = eqx.filter_jit(GainModel.turned)
+
+
+@pytest.mark.parametrize("delay", [-1.23, 0.0, 0.049, 0.4321, 1.5])
+def test_a_delay_turns_each_band_by_its_own_phase(delay):
+    """To the first neglected terms of the series, for up to 0.05 samples from the table."""
+    model = ten()[0].model
+    angle = np.asarray(model.turn)
+    limit = (0.05 * np.abs(angle).max()) ** 8 / 40_320 + 1e-15 * 50
+    found = turned(model, jnp.asarray(delay))
+    np.testing.assert_allclose(found, np.exp(1j * angle * delay), rtol=0, atol=limit)
+
+
 outputs = eqx.filter_jit(GainModel.expected)
 
 
