@@ -179,16 +179,15 @@ def nothing_found() -> etid.Selection:
     return etid.Selection.of({0: one}, 0, usual_circuits())
 
 
-def narrow(*of: Any) -> Figure:
+def narrow(*of: Any, height: float = 6.0, **options: Any) -> Figure:
     """A picture as wide as the column of a paper."""
-    figure = etid.plot(*of, size=(3.3, 6.0))[0].figure
+    figure = etid.plot(*of, **options, size=(3.3, height))[0].figure
     plt.close(figure)
     return figure
 
 
-def components() -> tuple[list[Components], list[str]]:
+def components(of: Fits) -> tuple[list[Components], list[str]]:
     """Variations of the elements, and the conditions."""
-    of = fits()
     return tables.components(of, of.summary("subject", "condition")), tables.frequent(of, 4)
 
 
@@ -253,6 +252,9 @@ def faults(figure: Figure) -> list[str]:
     return found
 
 
+# Of the largest number of a list. The same commands give the same digits; the condition of the
+# equations behind an error bar takes rounding of a processor up to 1e-7.
+TOLERANCE = 1e-4
 # What of an artist is compared: what it shows and how, but no places that depend on letters.
 SHOWN = (
     *("label", "text", "color", "facecolor", "edgecolor", "linestyle", "linewidth", "marker"),
@@ -311,6 +313,20 @@ def described(figure: Figure) -> list[dict[str, Any]]:
     return found
 
 
+def compare(found: list[dict[str, Any]], expected: list[dict[str, Any]]) -> None:
+    """Raise AssertionError if two descriptions differ by more than `TOLERANCE`."""
+    assert [one["kind"] for one in found] == [one["kind"] for one in expected]
+    for one, other in zip(found, expected, strict=True):
+        for key in one.keys() | other.keys():
+            told = f"{one['kind']} {one.get('label', '')}: {key}"
+            if isinstance(one.get(key), list) and key != "ticks":
+                values = [np.asarray(of.get(key), float) for of in (one, other)]
+                size = np.max(np.abs(values[1]), initial=0.0, where=np.isfinite(values[1]))
+                np.testing.assert_allclose(*values, rtol=0, atol=TOLERANCE * size, err_msg=told)
+            else:
+                assert one.get(key) == other.get(key), told
+
+
 def of_report(call: Callable[..., bytes], *arguments: Any) -> Figure:
     """The figure that a function of a report draws."""
     drawn: list[Figure] = []
@@ -344,9 +360,9 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "report_distributions": lambda: of_report(figures.distributions, fits()),
     "report_subjects": lambda: of_report(figures.by_subject, fits()),
     "report_quality": lambda: of_report(
-        figures.quality, *np.geomspace(0.9, 9.0, 40).reshape(2, 20)
+        figures.quality, np.geomspace(0.9, 9.0, 20), np.linspace(0.01, 0.02, 20)
     ),
-    "report_components": lambda: of_report(figures.components, *components()),
+    "report_components": lambda: of_report(figures.components, *components(fits())),
     "report_fits": lambda: of_report(figures.each_fit, fits()),
     "report_electrodes": lambda: of_report(figures.electrodes, display(), "c_p", FINGERTIP),
     "report_drivers": lambda: of_report(figures.drivers, {"98k8": driver()}),

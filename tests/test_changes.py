@@ -335,9 +335,8 @@ def test_a_driver_that_changes_moves_no_load_behind_a_measured_current():
 def test_noise_of_bands_is_that_of_their_second_differences():
     """Bands with unequal weights: unit variance over the weight, about a smooth change."""
     rng, weight = np.random.default_rng(7), np.array([[1.0, 4.0, 0.5, 2.0, 9.0, 1.0]])
-    count = 20_000
-    white = (rng.normal(size=(2, 1, count, 6)) * np.sqrt(0.5 / weight[0])).T
-    gain = (white[..., 0] + 1j * white[..., 1]).T + np.arange(6.0)
+    real, imaginary = rng.normal(size=(2, 1, 20_000, 6)) * np.sqrt(0.5 / weight)
+    gain = real + 1j * imaginary + np.arange(6.0)
     # The mean over the periods is taken from each, which is one degree of freedom less.
     [found] = _noise_of_single(gain - gain.mean(axis=1, keepdims=True), weight)
     assert found == pytest.approx(0.5, rel=0.02)  # 80 000 differences know it to 0.5 %

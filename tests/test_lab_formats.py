@@ -125,8 +125,7 @@ def test_a_labview_file_without_times_and_intervals_needs_a_sample_rate(tmp_path
     path = virtual(tmp_path, [""] * 2000)
     text = path.read_text()
     path.write_text("\n".join(one for one in text.split("\n") if not one.startswith("Delta_X")))
-    told = {name: of for name, of in FIELDS.items() if name != "sample_rate"}
-    refused(path, None, "sample_rate", **NAMES, **told)
+    refused(path, None, "sample_rate", **NAMES, **FIELDS)
     assert imported(path, **NAMES, sample_rate=RATE)[0][0].sample_rate == RATE
 
 

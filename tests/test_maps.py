@@ -16,11 +16,7 @@ from tests import pictures
 
 @pytest.fixture(scope="module")
 def display():
-    """Three fits of each of two days at the same electrodes; the last of each is no success."""
-    fits = pictures.fits().take(np.array([0, 2, 1] * 2))
-    names = np.array(["E1", "E8", "E98", "E1", "E9", "E98"], object)
-    days = np.array(["d1"] * 3 + ["d2"] * 3, object)
-    return dataclasses.replace(fits, labels={**fits.labels, "electrode": names, "session": days})
+    return pictures.display()
 
 
 def test_the_display_of_the_paper_has_98_places_two_millimetres_apart():

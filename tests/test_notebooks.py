@@ -16,10 +16,12 @@ from matplotlib.testing.compare import compare_images
 
 from etid.numpy_tier.tiers import COMPILING
 from tests.conftest import REFERENCE_DATA
-from tests.test_plotting import TOLERANCE
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
+# Root mean square of the differences of grey values, of 255. The same commands give 0; with another
+# release of FreeType letters differ by 1 to 3. A curve that is missing gives 4 and more.
+TOLERANCE = 3.0
 ROOT = pathlib.Path(__file__).parents[1]
 CONCLUSIONS = ROOT / "tests" / "conclusions"  # what must hold after each notebook
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))

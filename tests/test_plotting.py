@@ -1,6 +1,7 @@
 """Pictures: what is in each, what its axes say, and what is refused."""
 
 import dataclasses
+import functools
 import json
 
 import jax.numpy as jnp
@@ -19,26 +20,31 @@ from etid.plotting.style import RED, new_figure
 from etid.recordings.preflight import Inspected
 from tests import pictures
 
-# Of the largest number of a list. The same commands give the same digits; the condition of the
-# equations behind an error bar takes rounding of a processor up to 1e-7.
-TOLERANCE = 1e-4
+EXPECTED = json.loads(pictures.DESCRIBED.read_text())
 
 
 @pytest.mark.parametrize("name", pictures.PICTURES)
 def test_a_picture_shows_what_it_did(name):
     """After a change that is meant: `python -m tests.pictures`, and look at what it made."""
-    expected = json.loads(pictures.DESCRIBED.read_text())[name]
-    found = pictures.described(pictures.drawn(name))
-    assert [one["kind"] for one in found] == [one["kind"] for one in expected]
-    for one, other in zip(found, expected, strict=True):
-        for key in one.keys() | other.keys():
-            told = f"{one['kind']} {one.get('label', '')}: {key}"
-            if isinstance(one.get(key), list) and key != "ticks":
-                values = [np.asarray(of.get(key), float) for of in (one, other)]
-                size = np.max(np.abs(values[1]), initial=0.0, where=np.isfinite(values[1]))
-                np.testing.assert_allclose(*values, rtol=0, atol=TOLERANCE * size, err_msg=told)
-            else:
-                assert one.get(key) == other.get(key), told
+    pictures.compare(pictures.described(pictures.drawn(name)), EXPECTED[name])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda axis: axis.lines[0].remove(),
+        lambda axis: axis.lines[0].set_ydata(1.001 * axis.lines[0].get_ydata()),
+        lambda axis: axis.lines[0].set_color("red"),
+        lambda axis: axis.figure.legends[0].remove(),
+        lambda axis: axis.set_xscale("linear"),
+    ],
+    ids=["curve", "data", "colour", "legend", "scale"],
+)
+def test_a_picture_that_lacks_or_changes_something_is_different(change):
+    figure = pictures.drawn("impedances")
+    change(figure.axes[0])
+    with pytest.raises(AssertionError):
+        pictures.compare(pictures.described(figure), EXPECTED["impedances"])
 
 
 def title(axis):
@@ -249,14 +255,9 @@ def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, 
     ],
 )
 def test_a_picture_for_a_column_of_a_paper_is_whole_and_clear(name, height, rows, monkeypatch):
-    import matplotlib.pyplot as plt
-
-    def narrow(*of, **options):
-        return etid.plot(*of, **options, size=(3.3, height), title=None)[0].figure
-
+    narrow = functools.partial(pictures.narrow, height=height, title=None)
     monkeypatch.setattr(pictures, "figure_of", narrow)
     figure = pictures.PICTURES[name]()
-    plt.close(figure)
     assert pictures.faults(figure) == []
     assert len({round(axis.get_position().y0, 2) for axis in figure.axes}) == rows
 

@@ -269,18 +269,18 @@ def test_the_variation_between_subjects_is_relative_to_the_median_that_the_table
         assert one.parts["between subjects"] * one.median == pytest.approx(between)
 
 
-def test_figures_of_a_report_are_whole_and_clear(monkeypatch):
-    drawn = []
-    monkeypatch.setattr(figures, "svg", lambda figure: drawn.append(figure) or b"")
+def test_figures_of_a_report_are_whole_and_clear():
     fits = fits_of(
         np.linspace(1.0, 1.3, 12), ["successful"] * 12, subject=np.repeat(["a", "b"], 6),
         condition=np.array(["dry", "damp", "after washing"] * 4),
     )  # fmt: skip
-    figures.quality(np.linspace(0.9, 1.03, 5), np.linspace(3.19e-3, 3.34e-3, 5))
-    figures.distributions(fits)
-    figures.by_subject(fits)
-    of_groups = tables.components(fits, fits.summary("subject", "condition"))
-    figures.components(of_groups, tables.frequent(fits, 4))
+    both = np.linspace(0.9, 1.03, 5), np.linspace(3.19e-3, 3.34e-3, 5)
+    drawn = [
+        pictures.of_report(figures.quality, *both),
+        pictures.of_report(figures.distributions, fits),
+        pictures.of_report(figures.by_subject, fits),
+        pictures.of_report(figures.components, *pictures.components(fits)),
+    ]
     assert [pictures.faults(figure) for figure in drawn] == [[]] * 4
     assert [len(figure.legends) for figure in drawn] == [0, 1, 1, 1]
 
