@@ -114,7 +114,7 @@ def test_a_record_for_which_no_default_is_left_says_what_to_do():
     recording, driver, _ = fitted()
     v_th, v_out = recording.v_th[:3_334], recording.v_out[:3_334]
     single, circuit = recording.replace(v_th=v_th, v_out=v_out), SkinDavidsonCole()
-    says = "Record three periods or more .* or ask for method='maximum_likelihood'"
+    says = "Record three periods or more .* or ask for the method maximum_likelihood"
     with pytest.raises(ValueError, match=says):
         etid.identify_skin(single, driver, circuit=circuit)
     fits = etid.identify_skins([single], driver, circuit=circuit)

@@ -122,7 +122,7 @@ SHOWN = {
     "driver": (driver, ["Driver of order 3: successful", "|Z_th| at 1 kHz", "±", "kΩ"]),
     "study fits": (
         lambda: etid.StudyFits(fits(), {("a/b", "c"): driver()}, {("d",): "no signal"}),
-        ["3 fits of SkinRC", "1 driver, 1 failed", "a/b, c 3 successful", "d: no signal"],
+        ["3 fits of SkinRC", "2 drivers, 1 failed", "a/b, c 3 successful", "d: no signal"],
     ),
     "recording": (lambda: study()["s01/dry"], ["s01/dry", "200000 Hz", "<b>"]),
     "study": (study, ["1 calibration, 1 loaded"]),

@@ -85,7 +85,7 @@ etid.identify_impedance([1.0, 2.0, 3.0], [1.0, np.nan, 3.0]) -> 1 impedances are
 etid.identify_impedance([1.0], [1.0]) -> cannot determine 3 elements
 etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 0.0, 3.0]) -> impedance is 0
 dataclasses.replace(of.fit, method='output_error').posterior(of.skin, of.driver)
-    -> method='maximum_likelihood'
+    -> the method maximum_likelihood
 of.fit.profile('cp') -> 'cp' is no element of SkinRC
 of.fit.posterior(draws=0) -> at least 1
 of.batch.posterior(of.skin, of.driver) -> take one of them

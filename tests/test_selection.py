@@ -260,7 +260,7 @@ def test_a_study_that_no_circuit_explains_gets_the_best_one():
 def test_an_inconsistent_fit_names_another_circuit_where_a_score_shows_one():
     asks = made(etid.SkinRC(), 1400.0, "inconsistent", (19.0, *[0.0] * 8))
     assert "spread of time constants that the circuit cannot make (19" in asks.other_circuit
-    assert "Another circuit is the likelier cause: try circuit='auto'" in str(asks)
+    assert "Another circuit is the likelier cause: let etid choose it" in str(asks)
     assert asks.note.startswith("The residual looks like")
     # Too little, a gain, and a driver with 30 % more leakage inductance.
     fast = (-7.5, 0.0, 0.0, 0.0, 5.1, 6.9, 12.1, 13.2, -1.9)

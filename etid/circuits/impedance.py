@@ -177,7 +177,7 @@ class AbstractIrrational(AbstractElement):
         """Raise ValueError: the impedance is not a ratio of polynomials."""
         raise ValueError(
             f"{type(self).__name__} is no rational function of s; use "
-            "method='maximum_likelihood', which evaluates Z(s) at harmonics"
+            "the method maximum_likelihood, which evaluates Z(s) at harmonics"
         )
 
     def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:

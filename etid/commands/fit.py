@@ -272,6 +272,7 @@ def _data(outcome: StudyFits) -> dict[str, Any]:
             "order": driver.order,
             "rrse": driver.rrse,
             "chi2": driver.chi2,
+            "note": driver.note,
         }
         for paths, driver in outcome.drivers.items()
     ]

@@ -59,16 +59,16 @@ def serving(driver: AbstractFeed, kind: type[_Kind], method: str) -> _Kind:
     if not isinstance(driver, Driver):
         raise ValueError(
             f"method {method!r} identifies loads of an identified driver only, not from a measured "
-            "current; use method='maximum_likelihood' or 'output_error'"
+            "current; use the method maximum_likelihood or output_error"
         )
     if not isinstance(driver, ContinuousDriver):
         raise ValueError(
             f"this driver was identified by {driver.method}, which gives no continuous source "
-            f"impedance; identify it with method={method!r}"
+            f"impedance; identify it with the method {method}"
         )
     raise ValueError(
         f"this driver was identified by {driver.method}, which keeps no harmonics of its "
-        "calibrations; identify it with method='maximum_likelihood'"
+        "calibrations; identify it with the method maximum_likelihood"
     )
 
 
@@ -176,7 +176,7 @@ class AbstractEstimator(abc.ABC):
         if not self.any_circuit and not isinstance(circuit, SkinRC):
             raise ValueError(
                 f"method {str(self)!r} identifies SkinRC only, not {type(circuit).__name__}; "
-                "use method='maximum_likelihood'"
+                "use the method maximum_likelihood"
             )
 
     def check_driver(self, driver: AbstractFeed, sample_rate: float) -> None:
@@ -194,7 +194,7 @@ class AbstractEstimator(abc.ABC):
             raise ValueError(
                 f"{self} needs recording and calibration at the same sample rate; the recording "
                 f"has {sample_rate:g} Hz and the driver {float(found.sample_rate):g} Hz; "
-                "use method='output_error'"
+                "use the method output_error"
             )
 
     def __str__(self) -> str:

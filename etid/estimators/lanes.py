@@ -238,7 +238,7 @@ class HarmonicsWithCurrent(Harmonics):
     @classmethod
     def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "HarmonicsWithCurrent":
         """Refused: bare arrays have no current."""
-        raise ValueError("arrays have no current; use method='maximum_likelihood'")
+        raise ValueError("arrays have no current; use the method maximum_likelihood")
 
     def realigned(self, late: Lags) -> "HarmonicsWithCurrent":
         """The lane with `v_out` and the current advanced by whole samples, each by its own lag."""

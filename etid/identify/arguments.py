@@ -184,7 +184,7 @@ def order_of(value: Any) -> Order:
     raise RecordingError(
         f"is {reprlib.repr(value)}, must be a whole number from 2 to {LARGEST_ORDER}, or 'auto'",
         field="order",
-        remedy='Pass a number of poles, as in order=5, or order="auto"',
+        remedy="Pass a number of poles, such as 5, or 'auto'",
     )
 
 

@@ -113,7 +113,7 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     rough = [of_calibrations.rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
     if max(rough) > of_calibrations.ROUGHLY * min(rough):
         shown = ", ".join(
-            f"{one.recording.path!r} {z / 1e3:.3g} kohm" for one, z in zip(seen, rough, strict=True)
+            f"{one.recording.path!r} {z / 1e3:.3g} kΩ" for one, z in zip(seen, rough, strict=True)
         )
         text = f"calibrations show impedances of about {shown}: resistors_disagree. "
         raise IdentificationError(text + message("resistors_disagree"), None)
@@ -153,8 +153,7 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
             said += [f"start {int(driver.start)} won", *filter(None, [str(driver.tried)])]
         LOG.info("%s: %s", seen[0].recording.path, "; ".join(said))
     if throw and driver.verdict != "successful":
-        found = f"{driver.verdict}, |Z_th| is {size:.3g} ohm at 1 kHz"
-        raise IdentificationError(f"driver: {found}. {message(driver.verdict)}", driver)
+        raise IdentificationError(f"driver: {driver.verdict}. {driver.note}", driver)
     return driver
 
 

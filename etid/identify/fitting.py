@@ -418,11 +418,18 @@ def concluded(
     )
 
 
-def notes_of(fits: Fit) -> list[str]:
-    """The note of each of several fits."""
+def notes_of(fits: Fit, feed: AbstractFeed) -> list[str]:
+    """The note of each of several fits behind one driver, or by their currents."""
     more = "changed", "misfit", "out_of_bounds", "inconsistent"  # than the message of the verdict
     names = enumerate(fits.verdict.tolist())
-    return [taken(fits, row).note if name in more else message(name) for row, name in names]
+    notes = (taken(fits, row).note if name in more else message(name) for row, name in names)
+    return [with_driver(note, feed) for note in notes]
+
+
+def with_driver(note: str, feed: AbstractFeed | None) -> str:
+    """The note of a fit, and why its driver failed if it did."""
+    why = feed.why if note and isinstance(feed, Driver) else ""
+    return " ".join(filter(None, (note, why)))
 
 
 def remarks_on(seen: Inspected, estimator: AbstractEstimator) -> int:

@@ -70,7 +70,7 @@ from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.recordings.study import Study
 from etid.results.driver import HarmonicDriver, Order
-from etid.results.feed import MeasuredCurrent
+from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
 from etid.results.instrument import ERRORS, Instrument, by_tolerance
 from etid.results.study_fits import PLAUSIBLE, StudyFits
@@ -334,8 +334,8 @@ def identify_jointly(
     notes = [""] * len(paths)
     refused: dict[int, Refusal] = {}
 
-    def keep(rows: Sequence[int], found: Fit) -> None:
-        for row, fit, text in zip(rows, unstacked(found), notes_of(found), strict=True):
+    def keep(rows: Sequence[int], found: Fit, feed: AbstractFeed) -> None:
+        for row, fit, text in zip(rows, unstacked(found), notes_of(found, feed), strict=True):
             fits[row], notes[row] = fit, text
 
     groups: dict[tuple[str, ...], dict[Any, _Group]] = {}
@@ -346,7 +346,7 @@ def identify_jointly(
             refused[row] = NOT_PERIODIC if refusal.name == NOT_PERIODIC.name else refusal
         elif isinstance(batch.like.driver, MeasuredCurrent):
             found = batch.fitted(only.circuits, len(paths)).only
-            keep(batch.rows, dataclasses.replace(found, method=METHOD))
+            keep(batch.rows, dataclasses.replace(found, method=METHOD), batch.like.driver)
         elif batch.like.estimator.lane.periodic:
             for row, seen in zip(batch.rows, batch.seen, strict=True):
                 check_new(f"study[{paths[row]!r}]", seen.recording, first)
@@ -362,7 +362,7 @@ def identify_jointly(
         together = list(lengths.values())
         found, drivers.found[names] = _fit_together(only, together)
         for group, judged in zip(together, found, strict=True):
-            keep(group.rows, judged)
+            keep(group.rows, judged, drivers.found[names])
     of_drivers = [of for of in drivers.found.values() if isinstance(of, HarmonicDriver)]
     if any(of.instrument is not None for of in of_drivers):
         none = np.full((len(ERRORS), len(only.circuit.names())), np.nan)

@@ -132,7 +132,7 @@ class Options:
         if not isinstance(estimator, MaximumLikelihood | OutputError):
             raise ValueError(
                 f"method {str(estimator)!r} takes no known elements and no bounds; use "
-                "method='maximum_likelihood' or 'output_error'"
+                "the method maximum_likelihood or output_error"
             )
         return dataclasses.replace(estimator, known_elements=self.known, bounds=self.bounds)
 
@@ -224,7 +224,7 @@ def check_circuits(estimator: AbstractEstimator, circuits: Sequence[AbstractCirc
     if len(circuits) > 1 and not estimator.chooses:
         raise ValueError(
             f"method {str(estimator)!r} computes no likelihood, which the choice of a circuit "
-            "needs; use method='maximum_likelihood'"
+            "needs; use the method maximum_likelihood"
         )
     for circuit in circuits:
         estimator.check_circuit(circuit)
@@ -237,14 +237,14 @@ def check_instrument(instrument: Instrument | None, estimator: AbstractEstimator
     if not issubclass(estimator.driver, ContinuousDriver):
         raise ValueError(
             "the tolerances of an instrument enter standard errors, and method "
-            f"{str(estimator)!r} gives none; use method='maximum_likelihood', or state nothing, as "
-            "in instrument=etid.Instrument() or --tolerance drift=0"
+            f"{str(estimator)!r} gives none; use the method maximum_likelihood, or state nothing: "
+            "instrument=etid.Instrument() or --tolerance drift=0"
         )
     if instrument.stored().keys() - {"drift"}:
         raise ValueError(
             "the tolerances of an instrument are parameters of maximum likelihood, and the method "
             f"is {str(estimator)!r}, which has the drift of a driver only; record three pulse "
-            "periods or more, or state nothing else, as in instrument=etid.Instrument() or "
+            "periods or more, or state nothing else: instrument=etid.Instrument() or "
             "--tolerance drift=0"
         )
 
@@ -285,8 +285,8 @@ def check_order(order: Order, estimator: AbstractEstimator) -> None:
     """Raise ValueError if an estimator cannot choose the order that it is asked to choose."""
     if order == AUTO and not issubclass(estimator.driver, HarmonicDriver):
         raise ValueError(
-            f'order="auto" needs maximum likelihood, but the method is {str(estimator)!r}; give a '
-            "number of poles, as in order=5, or record several whole pulse periods"
+            f"order 'auto' needs maximum likelihood, but the method is {str(estimator)!r}; give a "
+            "number of poles, such as 5, or record several whole pulse periods"
         )
 
 
@@ -312,8 +312,8 @@ def check_default(estimator: AbstractEstimator, circuits: Sequence[AbstractCircu
         raise ValueError(
             "the record holds less than two whole pulse periods or begins in a pulse, or its "
             f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
-            "three periods or more and identify the driver with method='maximum_likelihood', or "
-            "ask for method='maximum_likelihood', whose standard errors do not include the "
+            "three periods or more and identify the driver with the method maximum_likelihood, or "
+            "ask for the method maximum_likelihood, whose standard errors do not include the "
             "effect of aliases in a single period"
         ) from error
 
@@ -338,7 +338,7 @@ def plan(
         if not seen.has_all:
             raise ValueError(
                 f"recording {seen.recording.path!r}: method {str(estimator)!r} needs a driver and "
-                "a current, and no disturbed periods; use method='maximum_likelihood'"
+                "a current, and no disturbed periods; use the method maximum_likelihood"
             )
         if seen.by_current is not None and seen.by_current.is_aliased:
             name = "biased"

@@ -273,7 +273,7 @@ def given(
     if fit.method.partition("(")[0] != MAXIMUM_LIKELIHOOD.name:
         raise ValueError(
             f"this fit was made by {fit.method}; identify the recording with "
-            f"method={MAXIMUM_LIKELIHOOD.name!r}"
+            f"the method {MAXIMUM_LIKELIHOOD.name}"
         )
     cov = _determined(fit)
     seen = Inspected(recording)

@@ -14,7 +14,7 @@ from etid.estimators.lanes import stacked, taken, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import require
 from etid.identify.driver import calibrated
-from etid.identify.fitting import Batch, CandidateFits, notes_of
+from etid.identify.fitting import Batch, CandidateFits, notes_of, with_driver
 from etid.identify.options import Circuit, FitOptions, Interval, Options, candidates_of
 from etid.identify.planning import Load, batches, failed_fit
 from etid.precision import in_float64
@@ -197,10 +197,11 @@ class Drivers:
 
 
 class _Part(NamedTuple):
-    """Fits of some recordings, and why they were refused if they were."""
+    """Fits of some recordings and what fed them, or why they were refused."""
 
     rows: list[int]
     found: CandidateFits
+    feed: AbstractFeed | None = None
     note: str = ""
 
 
@@ -209,11 +210,11 @@ def _parts(count: int, load: Load, options: Options, progress: bool, total: int)
     otherwise = str(options.estimator or MAXIMUM_LIKELIHOOD)
     for batch in batches(count, load, options, progress):
         if isinstance(batch, Batch):
-            yield _Part(batch.rows, batch.fitted(options.circuits, total))
+            yield _Part(batch.rows, batch.fitted(options.circuits, total), batch.like.driver)
         else:
             row, refusal = batch
             fit = failed_fit(refusal.name, options, otherwise)
-            yield _Part([row], CandidateFits(stacked([fit])), refusal.note)
+            yield _Part([row], CandidateFits(stacked([fit])), note=refusal.note)
 
 
 def choices(
@@ -235,7 +236,7 @@ def choices(
             found[row] = Selection.of(
                 part.found[number], part.found.chosen(number), options.circuits
             )
-            notes[row] = part.note or found[row].fit.note
+            notes[row] = part.note or with_driver(found[row].fit.note, part.feed)
     return [found[row] for row in range(count)], notes
 
 
@@ -244,7 +245,9 @@ def _fits(
 ) -> tuple[Fit, list[str]]:
     """The fit of the only circuit to each recording, stacked, and notes; see `choices`."""
     parts = list(_parts(count, load, options, progress, total))
-    of_parts = [[part.note] if part.note else notes_of(part.found.only) for part in parts]
+    of_parts = [
+        [part.note] if part.feed is None else notes_of(part.found.only, part.feed) for part in parts
+    ]
     order = np.argsort([row for part in parts for row in part.rows])
     fits = taken(concatenated([part.found.only for part in parts]), order)
     texts = list(itertools.chain.from_iterable(of_parts))

@@ -87,7 +87,7 @@ def drivers(
                 significant(100 * float(driver.rrse)),
                 significant(float(driver.chi2), 3),
                 element(abs(complex(z[0])), float(error[0]), 1e3),
-                message(driver.verdict),
+                driver.note,
             )
         )
     return Table(*_without_empty(heads, rows[:ROWS]))

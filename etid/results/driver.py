@@ -190,9 +190,30 @@ class Driver(AbstractFeed):
         """
         return jnp.abs(self.response(frequency)) * self.log_response_stderr(frequency)[0]
 
+    @property
+    def note(self) -> str:
+        """The message of the verdict, with the numbers that explain it."""
+        return f"{message(self.verdict)} {self._numbers()}".strip()
+
+    @property
+    def why(self) -> str:
+        """The verdict and its note, for fits behind this driver; empty if it is successful."""
+        return "" if self.verdict == "successful" else f"Its driver: {self.verdict}. {self.note}"
+
+    def _numbers(self) -> str:
+        """A sentence with the numbers that explain the verdict; empty if there are none."""
+        if self.verdict == "misfit":
+            return f"chi2 is {float(self.chi2):.3g}; noise alone gives 1."
+        if self.verdict == "implausible":
+            return f"|Z_th| is {abs(self._at_1_khz()):.4g} ohm at 1 kHz."
+        return ""
+
+    def _at_1_khz(self) -> complex:
+        return complex(np.asarray(self.response(jax.device_put(np.array([1e3]))))[0])
+
     def _overview(self) -> Overview:
         at, verdict = jax.device_put(np.array([1e3])), self.verdict
-        z = complex(np.asarray(self.response(at))[0])
+        z = self._at_1_khz()
         of_size, of_phase = np.asarray(self.log_response_stderr(at))[:, 0].tolist()
         rows = [
             ("|Z_th| at 1 kHz", plus_minus(abs(z) / 1e3, of_size * abs(z) / 1e3), "kΩ"),
@@ -297,11 +318,22 @@ class ContinuousDriver(Driver):
         parts = jnp.stack([relative.real, relative.imag])
         return jnp.sqrt(jnp.einsum("cif,ij,cjf->cf", parts, self.cov, parts))
 
+    def _numbers(self) -> str:
+        if self.verdict == "resistors_disagree":
+            return " ".join(f"{line}." for line in self._mismatches())
+        if self.verdict == "implausible":  # as it was given, in ohm
+            known = " and ".join(f"{r:.6g}" for r in self.calibration.r_load.tolist())
+            return f"With r_load {known} ohm, {super()._numbers()}"
+        return super()._numbers()
+
     def _findings(self) -> list[str]:
-        known, tried = self.calibration, [str(self.tried)] if self.tried.orders else []
+        return [*([str(self.tried)] if self.tried.orders else []), *self._mismatches()]
+
+    def _mismatches(self) -> list[str]:
+        known = self.calibration
         if known.mismatch is None:
-            return tried
-        return tried + [
+            return []
+        return [
             f"r_load {float(r) / 1e3:.6g} kΩ is {100 * float(np.expm1(off)):+.3g}"
             f" ± {100 * float(error):.2g} % off what the others say"
             for r, off, error in zip(known.r_load, *known.mismatch, strict=True)

@@ -350,7 +350,7 @@ class Fit(Judged, HasSource[Circuit]):
         support = self.support
         if self.verdict != "inconsistent" or support is None or not support.is_of_circuit():
             return ""
-        likelier = "Another circuit is the likelier cause: try circuit='auto' first."
+        likelier = "Another circuit is the likelier cause: let etid choose it (auto)."
         return f"{support.looks_like()} {likelier}"
 
     @property
@@ -369,7 +369,8 @@ class Fit(Judged, HasSource[Circuit]):
         own = getattr(self, said.get(self.verdict, ""), "")
         doubtful = self.verdict in ("misfit", "inconsistent", "max_steps_reached")
         doubt = "Is what was told right, and in SI units?" if doubtful and self._told[1] else ""
-        return [*filter(None, (self.other_circuit, message(self.verdict), own, doubt))]
+        driver = "" if self.driver is None or self.verdict == "successful" else self.driver.why
+        return [*filter(None, (self.other_circuit, message(self.verdict), own, doubt, driver))]
 
     def _rows(self) -> list[tuple[str, str, str]]:
         values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())

@@ -202,7 +202,9 @@ class Fits(Overviewed, Generic[Circuit]):
             values, errors = (
                 np.array([group[name + part] for name in units]) for part in ("", "_stderr")
             )
-            elements = [text for _, text, _ in element_rows(units, values, errors)]
+            elements = ["-"] * len(units)
+            if group["successful"]:
+                elements = [text for _, text, _ in element_rows(units, values, errors)]
             rows.append((where, f"{group['successful']}/{group['fits']}", *elements))
         return Overview(
             f"{several(len(self), 'fit')} of {type(self.circuit).__name__}: "

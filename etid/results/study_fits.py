@@ -141,12 +141,16 @@ class StudyFits(Overviewed):
             (", ".join(paths), str(driver.order), driver.verdict, f"{float(driver.chi2):.3g}")
             for paths, driver in itertools.islice(self.drivers.items(), ROWS)
         ]
-        failures = itertools.islice(self.failures.items(), ROWS)
+        failed = dict(self.failures) | {
+            paths: f"{driver.verdict}. {driver.note}"
+            for paths, driver in self.drivers.items()
+            if driver.verdict != "successful"
+        }
         drivers = Overview(
-            f"{several(len(self.drivers), 'driver')}, {len(self.failures)} failed",
+            f"{several(len(self.drivers) + len(self.failures), 'driver')}, {len(failed)} failed",
             rows,
             ("calibrations", "order", "verdict", "chi2"),
-            [f"{', '.join(paths)}: {text}" for paths, text in failures],
+            [f"{', '.join(paths)}: {text}" for paths, text in list(failed.items())[:ROWS]],
             count=len(self.drivers),
         )
         return dataclasses.replace(self.fits._overview(), then=(drivers,))

@@ -25,7 +25,7 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
 
     unstable = (
         "The identified filters are unstable with this load: they cannot predict the voltage. "
-        "Use method='output_error', or repeat the calibration with less noise."
+        "Use the method output_error, or repeat the calibration with less noise."
     )
     nonphysical = (
         "An element is negative or not a number, an exponent exceeds 1, or the source impedance "
@@ -42,8 +42,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     misfit = (
         "The model misses the recording by more than its noise. Most likely it is another "
-        "circuit, or for a driver a higher order: try circuit='auto' or order='auto', and look at "
-        "the residual."
+        "circuit, or for a driver a higher order: let etid choose it (auto), and look at the "
+        "residual."
     )
     changed = (
         "The load or the driver changed during the record: the pulse periods differ by more than "
@@ -74,8 +74,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     inconsistent = (
         "Recording and calibrations contradict each other: the driver changed in between, r_load "
-        "is wrong, or the load is another circuit. Try circuit='auto', or calibrate again; beside "
-        "a driver, check the scale of a current too."
+        "is wrong, or the load is another circuit. Let etid choose the circuit (auto), or "
+        "calibrate again; beside a driver, check the scale of a current too."
     )
     out_of_bounds = (
         "Recording and bounds contradict each other: without its bounds an element lies more than "
@@ -114,12 +114,12 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     not_periodic = (
         "The record holds no whole pulse period, or begins in the middle of an edge. "
-        "Record a whole number of periods, or use method='output_error'."
+        "Record a whole number of periods, or use the method output_error."
     )
     unreadable = "The recording could not be read from its file; `etid check` says why."
     driver_failed = (
-        "The driver of this fit was not identified successfully; its own verdict says why. "
-        "Repeat the calibration before you use the elements."
+        "The driver of this fit was not identified successfully. Its own verdict says why: correct "
+        "the calibration before you use the elements."
     )
 
 
@@ -197,11 +197,11 @@ def message(name: str) -> str:
     if name == "max_steps_reached":  # lineax recommends an argument that etid does not have
         return (
             "The iteration did not converge; the fit reports the best iterate. "
-            "Average more periods, or use method='output_error'."
+            "Average more periods, or use the method output_error."
         )
     if name == "nonfinite":  # optimistix names no cause
         return (
             "inf or NaN appeared during the fit. Most likely the numbers are far from those of an "
-            "electrode: check the units and r_load, or use method='output_error'."
+            "electrode: check the units and r_load, or use the method output_error."
         )
     return RESULTS[RESULTS._name_to_item[name]]

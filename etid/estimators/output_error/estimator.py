@@ -73,7 +73,7 @@ class OutputError(AbstractEstimator):
             raise ValueError(
                 f"method {str(self)!r} needs a ratio of polynomials in s or constant phases, which "
                 f"the impedance of {type(circuit).__name__} is not; "
-                "use method='maximum_likelihood'"
+                "use the method maximum_likelihood"
             )
 
     def fit_driver(
