@@ -169,7 +169,7 @@ class AbstractCircuit(Overviewed, eqx.Module):
     def _overview(self) -> Overview:
         kind, values = type(self).__name__, np.asarray(self.values())
         batch = f", batch of {values.shape[:-1]}" if values.ndim > 1 else ""
-        formula = f": {self.formula}" if self.formula else ""
+        formula = f": {self.formula}" if self.formula not in ("", kind) else ""
         return Overview(f"{kind}{batch}{formula}", element_rows(self.units(), values))
 
     def __repr__(self) -> str:

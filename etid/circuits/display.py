@@ -54,6 +54,11 @@ def scaled(unit: str, value: float = np.nan, error: float = np.nan) -> tuple[flo
     return 10.0**power, PREFIXES[power] + SYMBOLS[unit]
 
 
+def number(value: float, form: str) -> str:
+    """A number in a format of Python such as `.3g`; a dash for what is not a finite number."""
+    return format(value, form) if math.isfinite(value) else "-"
+
+
 def heading(name: str, unit: str, value: float = np.nan) -> str:
     """Name and scaled unit of a parameter of about this value [SI], such as `r_s [kΩ]`."""
     symbol = scaled(unit, value)[1]
@@ -65,8 +70,10 @@ def plus_minus(value: float, error: float) -> str:
 
     Both are rounded to two significant digits of the error. Without an error, the value has four
     significant digits. The error of a fixed element, 1e-9 of it, is shown as 0. From 1e10 on, both
-    are powers of ten.
+    are powers of ten. A value that is not a finite number is a dash.
     """
+    if not math.isfinite(value):
+        return f"{'-':>10}            "
     if not np.isfinite(error) or error <= 0:
         return f"{value:10.4g}            "
     if error < 1e-8 * abs(value):

@@ -8,9 +8,11 @@ import abc
 import dataclasses
 import html
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
+import wadler_lindig as wl
 from jaxtyping import Float
 
 from etid.circuits.display import plus_minus, scaled
@@ -106,6 +108,13 @@ class Overviewed(abc.ABC):
     def __repr__(self) -> str:
         return str(self)
 
+    def __pdoc__(self, **_: Any) -> wl.AbstractDoc | None:
+        """The title alone inside of another object, as in the `repr` of a bound method."""
+        try:
+            return wl.TextDoc(f"<{self._overview().title}>")
+        except Exception:  # as above
+            return None
+
     def _repr_html_(self) -> str | None:
         try:
             return self._overview().html()
@@ -135,6 +144,6 @@ def element_rows(
         else:
             scale, symbol = scaled(unit)
             finite = values[..., i][np.isfinite(values[..., i])] / scale
-            text = f"{finite.min():.4g} … {finite.max():.4g}" if finite.size else "nan"
+            text = f"{finite.min():.4g} … {finite.max():.4g}" if finite.size else "-"
         rows.append((name, text, symbol))
     return rows

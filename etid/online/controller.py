@@ -52,6 +52,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import number
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.unknowns import LoadUnknowns
@@ -93,7 +94,13 @@ class Command(Overviewed):
     def _overview(self) -> Overview:
         found = ", ".join(f"{number} {name}" for name, number in counts(self.reason).items())
         rows = [
-            (str(at), str(reason), f"{amplitude:.3f}", f"{1e9 * charge:.1f}", f"{1e3 * peak:.2f}")
+            (
+                str(at),
+                str(reason),
+                f"{amplitude:.3f}",
+                number(1e9 * charge, ".1f"),
+                number(1e3 * peak, ".2f"),
+            )
             for at, (reason, amplitude, charge, peak) in enumerate(
                 zip(self.reason, self.amplitude, self.charge, self.peak, strict=True)
             )

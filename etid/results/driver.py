@@ -13,8 +13,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.circuits.display import plus_minus, several, unexplained
-from etid.circuits.overview import Overview
+from etid.circuits.display import number, plus_minus, several, unexplained
+from etid.circuits.overview import Overview, Overviewed
 from etid.numpy_tier.tiers import program
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import texts
@@ -75,7 +75,7 @@ class OrderEvidence(eqx.Module):
         return f"orders tried and their BIC above the least: {', '.join(found)}"
 
 
-class Calibration(eqx.Module):
+class Calibration(Overviewed, eqx.Module):
     """Results of the calibrations that a skin needs besides Z_th and its covariance.
 
     Attributes:
@@ -93,6 +93,19 @@ class Calibration(eqx.Module):
     delay_samples: Float[Array, " record"]
     delay_std_samples: Float[Array, ""]
     mismatch: Float[Array, "2 record"] | None = None
+
+    def _overview(self) -> Overview:
+        open_delay = float(self.delay_std_samples)
+        rows = [
+            (f"{float(ohm) / 1e3:g} kΩ", f"{float(delay):.3g}")
+            for ohm, delay in zip(self.r_load, self.delay_samples, strict=True)
+        ]
+        return Overview(
+            several(len(rows), "calibration"),
+            rows,
+            ("resistor", "trigger delay [samples]"),
+            [f"One delay of all is open: ± {number(open_delay, '.2g')} samples."],
+        )
 
 
 class Driver(AbstractFeed):

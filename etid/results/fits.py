@@ -15,7 +15,7 @@ from etid.circuits.display import heading, several
 from etid.circuits.lookup import class_path
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.errors import install
-from etid.recordings.fields import DESCRIBING, Label, wanted_labels
+from etid.recordings.fields import DESCRIBING, Label, check_names, wanted_labels
 from etid.results.fit import Fit
 from etid.results.fits_columns import (
     DESCRIBED,
@@ -192,6 +192,9 @@ class Fits(Overviewed, Generic[Circuit]):
         Returns:
             A row for each group, sorted by the labels. Numbers are in SI units; they are NaN if the
             group has no successful fit.
+
+        Raises:
+            RecordingError: A label does not exist.
         """
         return _summary(self, by)
 
@@ -206,12 +209,13 @@ class Fits(Overviewed, Generic[Circuit]):
             if group["successful"]:
                 elements = [text for _, text, _ in element_rows(units, values, errors)]
             rows.append((where, f"{group['successful']}/{group['fits']}", *elements))
+        title = f"{several(len(self), 'fit')} of {type(self.circuit).__name__}"
+        medians = "Median of the successful fits ± median standard error of one fit."
         return Overview(
-            f"{several(len(self), 'fit')} of {type(self.circuit).__name__}: "
-            f"{counted(self.verdicts)}",
+            f"{title}: {counted(self.verdicts)}" if len(self) else title,
             rows,
             ("", "successful", *itertools.starmap(heading, units.items())),
-            ("Median of the successful fits ± median standard error of one fit.",),
+            [medians] if "successful" in self.counts() else [],
         )
 
     def as_table(self) -> tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]:
@@ -270,6 +274,7 @@ class Fits(Overviewed, Generic[Circuit]):
 @np.errstate(over="ignore", invalid="ignore")  # of a damaged file
 def _summary(fits: Fits, by: Sequence[str]) -> list[dict[str, Any]]:
     """The rows of `Fits.summary`."""
+    check_names(dict.fromkeys(by), LABELS, "label")
     columns = [map(str, fits.labels[name].tolist()) for name in by]
     keys = list(zip(*columns, strict=True)) if by else [()] * len(fits)
     groups = sorted(set(keys))
