@@ -4,7 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from etid.solvers.matrices import inverse, inverse_of_few, inverse_root, root, root_of_few
+from etid.solvers.matrices import (
+    inverse,
+    inverse_of_few,
+    inverse_root,
+    is_definite,
+    root,
+    root_of_few,
+)
 
 # Rounding of an inverse: machine epsilon times the condition of the scaled matrix, below 1e3 here.
 EXACT = 1e-12
@@ -43,3 +50,14 @@ def test_a_direction_without_information_has_an_enormous_variance_or_none():
     matrix = jnp.diag(jnp.array([4.0, 0.0]))
     np.testing.assert_allclose(np.diagonal(inverse(matrix)), [0.25, 1e12])
     np.testing.assert_allclose(np.diagonal(inverse(matrix, drop=True)), [0.25, 0.0])
+
+
+def test_a_combination_without_variance_is_found_whatever_the_units_are():
+    matrix, scale = covariance()
+    assert is_definite(matrix)
+    same = matrix.copy()
+    same[0], same[:, 0] = matrix[1] * scale[0] / scale[1], matrix[:, 1] * scale[0] / scale[1]
+    same[0, 0] = matrix[1, 1] * (scale[0] / scale[1]) ** 2
+    assert not is_definite(same)
+    assert not is_definite(np.diag([1.0, 0.0]))
+    assert not is_definite(np.diag([1.0, np.nan]))

@@ -52,7 +52,7 @@ from etid.results.fit import Fit
 from etid.results.instrument import BUDGETED, ERRORS, NARROW, Budget, Instrument, by_tolerance
 from etid.results.posterior import Posterior
 from etid.solvers.importance_sampling import drawn
-from etid.solvers.matrices import inverse
+from etid.solvers.matrices import inverse, is_definite
 
 
 class Known(eqx.Module):
@@ -301,7 +301,7 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
     """
     values = np.asarray(fit.circuit.values())
     cov = np.asarray(fit.cov) / np.outer(values, values)
-    if not (np.isfinite(cov).all() and (np.linalg.eigvalsh(cov) > 0).all()):
+    if not is_definite(cov):
         raise _undetermined(fit)
     return cov
 

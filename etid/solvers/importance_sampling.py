@@ -14,6 +14,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
+from etid.solvers.matrices import is_definite
+
 FREEDOM = 30.0  # of Student's t: 16 unknowns; with 8 half of the draws are lost, with ∞ the tails
 ROUNDS = 6  # of draws, at most
 ENOUGH = 0.3  # effective draws that end the rounds, in draws of one round
@@ -56,7 +58,7 @@ def drawn(
         flat = _flattened(log_weight, min(SEVERAL * mean.size, ENOUGH * draws))
         mean = flat @ q
         cov = np.cov(q, rowvar=False, aweights=flat)
-        if np.linalg.matrix_rank(cov) < mean.size:  # of fewer draws than parameters
+        if not is_definite(cov):  # of fewer draws than parameters
             return q, weights
 
 

@@ -64,6 +64,17 @@ def inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jax.scipy.linalg.solve_triangular(factor, jnp.diag(1 / scale), lower=True).T
 
 
+def is_definite(cov: Float[np.ndarray, "n n"]) -> bool:
+    """Whether each combination of parameters has a variance, whatever their units are.
+
+    The variance of a fixed element is 10⁻¹⁸: only correlations have a common scale.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(cov), 0.0))
+    if not (np.isfinite(cov).all() and (scale > 0).all()):
+        return False
+    return bool(np.linalg.eigvalsh(cov / np.outer(scale, scale))[0] > SMALLEST)
+
+
 def diagonal(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
     """The diagonal of a matrix; `jnp.diagonal` is traced as twenty operations."""
     return jnp.where(np.eye(matrix.shape[0], dtype=bool), matrix, 0.0).sum(1)
