@@ -1,11 +1,13 @@
-"""float64 for all that etid computes, whatever precision the process has set for JAX."""
+"""float64 for all that etid computes and keeps, whatever the process has set for JAX."""
 
 import functools
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
+import equinox as eqx
 import jax
 import jax.core
+import numpy as np
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -46,3 +48,55 @@ def is_float64() -> bool:
     """Whether JAX computes in float64 here."""
     config: Any = jax.config  # its attributes are made at run time
     return config.jax_enable_x64
+
+
+class Kept:
+    """An object whose arrays keep type and bytes in copies and pickles.
+
+    A process of float32 makes arrays of float32 of all arrays of JAX that it unpickles, also of
+    those of float64. The arrays therefore travel as arrays of NumPy.
+    """
+
+    __slots__ = ()
+
+    def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        state: Any = super().__getstate__() or {}  # with what is in slots, if there is any
+        fields, slots = state if isinstance(state, tuple) else (state, {})
+        return _each(_packed, fields, Kept), _each(_packed, slots, Kept)
+
+    def __setstate__(self, state: tuple[dict[str, Any], dict[str, Any]]) -> None:
+        fields, slots = (_each(_unpacked, of, Kept | _Packed) for of in state)
+        self.__dict__.update(fields)
+        for name, value in slots.items():
+            object.__setattr__(self, name, value)
+
+
+class Module(Kept, eqx.Module):
+    """A module of equinox that is `Kept`."""
+
+
+class _Packed(NamedTuple):
+    """An array of JAX as one of NumPy."""
+
+    array: np.ndarray
+
+
+def _each(change: Callable[[Any], Any], fields: dict[str, Any], whole: Any) -> dict[str, Any]:
+    """The fields with every leaf changed; objects of the classes `whole` are leaves."""
+
+    def is_leaf(one: Any) -> bool:
+        return isinstance(one, whole)
+
+    return {name: jax.tree.map(change, of, is_leaf=is_leaf) for name, of in fields.items()}
+
+
+def _packed(leaf: Any) -> Any:
+    is_array = isinstance(leaf, jax.Array) and not isinstance(leaf, jax.core.Tracer)
+    return _Packed(np.asarray(leaf)) if is_array else leaf
+
+
+def _unpacked(leaf: Any) -> Any:
+    if not isinstance(leaf, _Packed):
+        return leaf
+    with jax.enable_x64(True):
+        return jax.device_put(leaf.array)

@@ -31,6 +31,7 @@ from etid.circuits.elements import (
 from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.numpy_tier.tiers import program
+from etid.precision import Module
 from etid.signals.transfer import frequency_variable
 
 _Same = TypeVar("_Same", bound="AbstractCircuit")
@@ -65,7 +66,7 @@ def _numbers(value: Any) -> Any:
     return numbers.astype(float) if numbers.dtype.kind in "biu" else numbers
 
 
-class AbstractCircuit(Overviewed, eqx.Module):
+class AbstractCircuit(Overviewed, Module):
     """A passive two-terminal circuit with positive parameters.
 
     Attributes:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from etid.precision import Module
 from etid.signals.filtering import StateSpace
 from etid.signals.transfer import Rational, reciprocal
 
@@ -72,7 +73,7 @@ class Notation(Names):
         self.values: list[float] = []
 
 
-class AbstractImpedance(eqx.Module):
+class AbstractImpedance(Module):
     """A network between two terminals, as a function of s [rad/s]."""
 
     @abc.abstractmethod

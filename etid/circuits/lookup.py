@@ -203,7 +203,7 @@ def _class_of(string: str) -> type[AbstractCircuit]:
         return _series(string, 0, element)[0]
 
     def restored(self: AbstractCircuit) -> tuple:
-        return _restored, (string, {name: getattr(self, name) for name in fields})
+        return _blank, (string,), self.__getstate__()
 
     body = {
         "__module__": STRINGS,
@@ -218,8 +218,9 @@ def _class_of(string: str) -> type[AbstractCircuit]:
     return kind(string, (AbstractCircuit,), body)
 
 
-def _restored(string: str, values: dict[str, Any]) -> AbstractCircuit:
-    return class_of(string)(**values)
+def _blank(string: str) -> AbstractCircuit:
+    """A circuit that has no values yet; a pickle of it restores them."""
+    return object.__new__(class_of(string))
 
 
 def _refuse(string: str, at: int) -> NoReturn:

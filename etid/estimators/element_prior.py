@@ -6,11 +6,11 @@ of the fit. Standard errors contain it like any measurement. A fixed element has
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.precision import Module
 
 FIXED = 1e-9  # standard deviation of the logarithm of a fixed element, below all errors of a fit
 
@@ -18,7 +18,7 @@ Known = tuple[tuple[str, float, float], ...]
 """Elements that are known: name, value and standard deviation [SI]; 0 for a fixed element."""
 
 
-class ElementPrior(eqx.Module):
+class ElementPrior(Module):
     """Prior of the logarithms of the elements.
 
     Attributes:

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.numpy_tier.tiers import program
+from etid.precision import Module
 from etid.results.driver import SourceImpedance
 from etid.results.fit import Support
 from etid.results.instrument import Instrument
@@ -28,7 +29,7 @@ SAME_LOAD = 0.01
 SOLVER = LevenbergMarquardt(rtol=1e-5, ftol=1e-6)  # 1e-3 standard errors at 10 000 samples
 
 
-class Estimate(eqx.Module):
+class Estimate(Module):
     """The result of a fit, without a verdict.
 
     Attributes:
@@ -69,7 +70,7 @@ class Estimate(eqx.Module):
     support: Support | None = None
 
 
-class Prior(eqx.Module):
+class Prior(Module):
     """The weak prior that `prior` makes.
 
     Attributes:

@@ -11,13 +11,13 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.precision import Module
 from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
@@ -47,7 +47,7 @@ class Lags(NamedTuple):
         return cls(*(round(by) if left < abs(by) < math.inf else 0 for by in late))
 
 
-class AbstractLane(eqx.Module):
+class AbstractLane(Module):
     """The arrays that an estimator fits: of one recording, or of several along a leading axis.
 
     Attributes:

@@ -60,7 +60,7 @@ from etid.identify.arguments import number_of, require
 from etid.online.current import CurrentModel
 from etid.online.state import ElectrodeState, TrackerState
 from etid.online.tracker import Tracker, for_each
-from etid.precision import in_float64
+from etid.precision import Kept, in_float64
 from etid.results.verdicts import counts
 from etid.solvers.matrices import inverse_of_few
 
@@ -135,7 +135,7 @@ class Limits(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)  # as `etid.online.tracker.Tracker`
-class Controller(Overviewed):
+class Controller(Overviewed, Kept):
     """Finds the amplitude of every pulse for a wanted charge or current.
 
     Make a controller with `Controller.of`.

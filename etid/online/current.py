@@ -28,12 +28,13 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.online.pulse_fit import GainModel, first_largest
+from etid.precision import Module
 from etid.signals.transfer import frequency_variable, reciprocal
 
 EDGE = 24  # [samples] after each edge that are looked at in steps of half a sample
 
 
-class Current(eqx.Module):
+class Current(Module):
     """Charge and peak current of a pulse, and their errors, per unit of relative amplitude.
 
     Attributes:
@@ -49,7 +50,7 @@ class Current(eqx.Module):
     peak_stderr: Float[Array, "*lane"]
 
 
-class CurrentModel(eqx.Module):
+class CurrentModel(Module):
     """Sums over bands that turn an admittance into charge and current.
 
     Attributes:

@@ -37,6 +37,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.online.projection import Projection, Seen
+from etid.precision import Module
 from etid.signals.harmonics import ALIASED
 from etid.signals.noise import RIPPLE
 from etid.signals.transfer import as_complex, power
@@ -76,7 +77,7 @@ def _edges(bins: int) -> Int[np.ndarray, " band1"]:
     return np.array([*first, bins + 1])
 
 
-class Bands(eqx.Module):
+class Bands(Module):
     """The unloaded pulse, and the bands in which loaded pulses are compared with it.
 
     Attributes:

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +22,7 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_bands import Bands
+from etid.precision import Module
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, combined, frequency_variable, power, reciprocal
 from etid.solvers.matrices import inverse_of_few, root
@@ -55,7 +55,7 @@ class Expected(NamedTuple):
     aliased: Complex[Array, "*lane band"]
 
 
-class GainModel(eqx.Module):
+class GainModel(Module):
     """Model of the gain of a pulse.
 
     Attributes:
@@ -279,7 +279,7 @@ def searched(
     return jax.lax.while_loop(going, stepped, first).own
 
 
-class Pulse(eqx.Module):
+class Pulse(Module):
     """The objective for one electrode at one pulse.
 
     Attributes:

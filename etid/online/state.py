@@ -3,7 +3,6 @@
 import dataclasses
 import math
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -17,6 +16,7 @@ from etid.estimators.score_tests.other_circuit import MOVED, SPREAD
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.alarms import SEEN_IN_PULSES, score_of
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
+from etid.precision import Module
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, counted, first_verdict, verdict_names
@@ -67,7 +67,7 @@ register_description(
 )
 
 
-class ElectrodeState(eqx.Module):
+class ElectrodeState(Module):
     """Estimates for one electrode, or for all electrodes along a leading axis.
 
     Attributes:
@@ -120,7 +120,7 @@ class ElectrodeState(eqx.Module):
     drifted: Int[Array, "*lane"]
 
 
-class TrackerState(Overviewed, eqx.Module):
+class TrackerState(Overviewed, Module):
     """Estimates for every electrode after a pulse.
 
     Attributes:

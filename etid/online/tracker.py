@@ -68,7 +68,7 @@ from etid.online.state import (
     fit_of,
 )
 from etid.online.tick import updated
-from etid.precision import in_float64
+from etid.precision import Kept, in_float64
 from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
@@ -90,7 +90,7 @@ NOTES = {
 
 # No `equinox.Module`: its methods would cost a twentieth of a tick at every call.
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Tracker(Overviewed):
+class Tracker(Overviewed, Kept):
     """Identifies the loads at all electrodes of a display with every pulse.
 
     Make a tracker with `Tracker.of`.

@@ -72,14 +72,6 @@ class HasSource(Generic[Circuit]):
         """The driver of the recording; None if there is none, or if it is not known."""
         return getattr(self, "_data", (None, None))[1]
 
-    def __getstate__(self) -> tuple[dict[str, Any], Any]:
-        return self.__dict__, (self.recording or self.measured, self.driver)
-
-    def __setstate__(self, state: tuple[dict[str, Any], Any]) -> None:
-        fields, data = state
-        self.__dict__.update(fields)
-        object.__setattr__(self, "_data", data)
-
     def source_or_own(
         self, recording: Recording | None, driver: Driver | None
     ) -> tuple[Recording | None, Driver | None]:

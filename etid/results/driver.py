@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.display import number, plus_minus, several, unexplained
 from etid.circuits.overview import Overview, Overviewed
 from etid.numpy_tier.tiers import program
+from etid.precision import Module
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import texts
 from etid.recordings.study import Study
@@ -34,7 +35,7 @@ AUTO: Literal["auto"] = "auto"
 LEAST, LARGEST = 4, 8
 
 
-class OrderEvidence(eqx.Module):
+class OrderEvidence(Module):
     """Evidence of the calibrations for each order that `order="auto"` tried.
 
     The arrays have one place for each order from `LEAST` to `LARGEST`. Drivers therefore share
@@ -75,7 +76,7 @@ class OrderEvidence(eqx.Module):
         return f"orders tried and their BIC above the least: {', '.join(found)}"
 
 
-class Calibration(Overviewed, eqx.Module):
+class Calibration(Overviewed, Module):
     """Results of the calibrations that a skin needs besides Z_th and its covariance.
 
     Attributes:

@@ -17,7 +17,6 @@ import abc
 import dataclasses
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +25,7 @@ from jaxtyping import Array, Complex, Float, Int
 from etid.circuits.impedance import realise
 from etid.circuits.overview import Overview
 from etid.numpy_tier.tiers import program
+from etid.precision import Module
 from etid.results.verdicts import RESULTS, Judged, verdict
 from etid.signals.filtering import StateSpace
 from etid.signals.transfer import Rational, as_complex
@@ -63,7 +63,7 @@ class AbstractFeed(Judged):
         """
 
 
-class SourceImpedance(eqx.Module):
+class SourceImpedance(Module):
     """Order-n rational Z_th(s) in modal form.
 
     Z_th = R + Σ_k (g_k + h_k s/ω_k) / (1 + 2 ζ_k s/ω_k + (s/ω_k)²) + Σ_j g_j / (1 + s/ω_j)
@@ -184,7 +184,7 @@ class SourceImpedance(eqx.Module):
         return StateSpace(A - B * drop[None, :], B, C, share[None])
 
 
-class CurrentSource(eqx.Module):
+class CurrentSource(Module):
     """The source of a measured current in continuous time: nothing but the load follows it.
 
     Attributes:

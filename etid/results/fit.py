@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.circuit import Circuit
 from etid.circuits.display import quantity, several, unexplained
 from etid.circuits.overview import Overview, element_rows
+from etid.precision import Module
 from etid.recordings.remarks import texts, words
 from etid.results.data import HasSource
 from etid.results.method_options import without_known
@@ -59,8 +60,12 @@ class IdentificationError(RuntimeError):
         super().__init__(text)
         self.outcome = outcome
 
+    def __reduce__(self) -> tuple:
+        # By default a copy would be made of the text alone, and a pool of processes would break.
+        return type(self), (str(self), self.outcome)
 
-class Support(eqx.Module):
+
+class Support(Module):
     """How well the data of a fit support its circuit.
 
     Attributes:
@@ -133,7 +138,7 @@ class Support(eqx.Module):
         return bool(z.max() >= 5.0 and np.argmax(z) < z.size - 1 - _FAST)
 
 
-class Limited(eqx.Module):
+class Limited(Module):
     """Bounds of the elements of a fit, or of a batch of fits.
 
     Attributes:

@@ -4,12 +4,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TypeVar
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.overview import Overview, Overviewed
+from etid.precision import Module
 
 _Number = float | Float[Array | np.ndarray, ""]
 _Kind = TypeVar("_Kind", bound="Instrument")
@@ -30,7 +30,7 @@ TOLERANCES = {
 NARROW = 1e-3  # of a tolerance that nobody stated: a prior that no recording changes
 
 
-class Instrument(eqx.Module):
+class Instrument(Module):
     """Standard deviations of errors of the instrument, each of mean 0 and independent.
 
     Some errors change a recording almost as the elements do: at 60 dB 0.1 % of gain moves R_p of

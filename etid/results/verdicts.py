@@ -14,6 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool
 
 from etid.circuits.overview import Overviewed
+from etid.precision import Module
 
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equinox enumerations extend by inheritance
@@ -160,7 +161,7 @@ def counted(names: np.ndarray) -> str:
     return ", ".join(f"{number} {name}" for name, number in counts(names).items())
 
 
-class Judged(Overviewed, eqx.Module):
+class Judged(Overviewed, Module):
     """An outcome with a verdict, or a batch of outcomes.
 
     Attributes:

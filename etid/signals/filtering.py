@@ -30,11 +30,12 @@ precision at 2 MHz. In single precision it overflows from 1 MHz on.
 import functools
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from etid.precision import Module
 
 BLOCK = 32  # samples; a larger block costs more in the Toeplitz product and less in the scan
 TAPS = 24  # samples of the interpolation kernel on each side of an interval
@@ -42,7 +43,7 @@ CUTOFF = 0.35  # cutoff of the interpolation as a fraction of the sample rate
 DEGREE = 7  # degree of the interpolating polynomial inside one interval
 
 
-class StateSpace(eqx.Module):
+class StateSpace(Module):
     """A linear system; each function that takes one says whether it is continuous or discrete."""
 
     A: Float[Array, "state state"]

@@ -30,12 +30,12 @@ import math
 from types import ModuleType
 from typing import NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid.precision import Module
 from etid.signals.transfer import power
 
 Values = TypeVar("Values", Array, np.ndarray)
@@ -47,7 +47,7 @@ ABSENT = 1e-6  # [standard deviations] coefficient and noise of a padded harmoni
 ROUNDING = 1e-12  # relative difference of two transforms of the same samples
 
 
-class Spectrum(eqx.Module):
+class Spectrum(Module):
     """Fourier coefficients [V] of both records at the harmonics.
 
     Attributes:

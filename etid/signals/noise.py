@@ -30,13 +30,13 @@ known for each f_c. The likeliest f_c is taken where the likelihood surely prefe
 import functools
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from etid.precision import Module
 from etid.signals.harmonics import DRIFT_DEGREE, WINDOW, harmonics, namespace
 
 # Order of the differences; the ringing after the edges, at a quarter of the rate, is still smooth
@@ -125,7 +125,7 @@ def _every(samples: int) -> int:
     return 2 if samples > 30_000 else 1
 
 
-class Measurement(eqx.Module):
+class Measurement(Module):
     """Both voltages of a recording and the noise of each.
 
     Attributes:

@@ -8,11 +8,12 @@ lane spoils the others.
 
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Inexact
+
+from etid.precision import Module
 
 
 def multiply_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[Array, " pq"]:
@@ -59,7 +60,7 @@ def combined(
     return jax.lax.complex(z @ slope.real, z @ slope.imag)
 
 
-class Rational(eqx.Module):
+class Rational(Module):
     """A ratio of polynomials, `(num[0] + num[1] x + …) / (den[0] + den[1] x + …)`.
 
     The variable x is s [rad/s] for impedances in continuous time and z⁻¹ for discrete filters.

@@ -40,6 +40,7 @@ from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
+from etid.precision import Module
 from etid.results.driver import HarmonicDriver
 from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots
@@ -65,7 +66,7 @@ class UnloadedEstimate(NamedTuple):
     log_variance_by_z: Float[Array, "z harmonic"]
 
 
-class GivenDriver(eqx.Module):
+class GivenDriver(Module):
     """What is given of the feed of the loads: the distribution of Z_th, or a measured current.
 
     Attributes:
