@@ -1,9 +1,10 @@
 """Changes of a module that its tests should notice, one at a time.
 
-Annotations, docstrings, texts, `assert`s for the type checker and decorators are left alone: what
-they change no test should see. So is what changes nothing by construction: the order of arguments
-of a function that does not know it, and `zip(..., strict=True)`. Three times a tiny constant is as
-tiny, so it becomes 1. A mutant of `os.sched_setaffinity` could act on other processes.
+Annotations, docstrings, `assert`s for the type checker and decorators are left alone: what they
+change no test should see. So is what changes nothing by construction: the order of arguments of a
+function that does not know it, and `zip(..., strict=True)`. Of errors only the text is changed.
+Three times a tiny constant is as tiny, so it becomes 1. A mutant of `os.sched_setaffinity` could
+act on other processes.
 """
 
 import ast
@@ -78,27 +79,80 @@ def _changed(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
             yield "condition negated", ast.IfExp(test, orelse, body)
         case ast.AugAssign() | ast.Expr(value=ast.Call()):
             yield "statement deleted", ast.Pass()
+        case ast.Tuple(elts=elements, ctx=ast.Load()) | ast.List(elts=elements, ctx=ast.Load()):
+            if exchanged := _exchanged(elements):
+                yield "columns exchanged", type(new)(exchanged, ast.Load())
+        case ast.Dict(keys=keys, values=values):
+            if exchanged := _exchanged(values):
+                yield "columns exchanged", ast.Dict(keys, exchanged)
+        case ast.Constant(value=str() as value) if any(map(str.isalpha, value)):
+            yield "text", ast.Constant(_other_text(value))
+        case ast.JoinedStr(values=values):
+            yield from (("text", ast.JoinedStr(other)) for other in _other_parts(values))
         case _:
             pass
 
 
-def _parts(node: ast.AST, inside: bool = False) -> Iterator[tuple[ast.AST, bool]]:
-    """Nodes whose change a test should see, from outside in; and whether a function has them."""
-    yield node, inside
+def _exchanged(elements: list[ast.expr]) -> list[ast.expr]:
+    """The elements with the first two exchanged; empty if that changes nothing."""
+    if len(elements) < 2 or ast.dump(elements[0]) == ast.dump(elements[1]):
+        return []
+    if any(isinstance(one, ast.Starred) for one in elements[:2]):
+        return []
+    return [elements[1], elements[0], *elements[2:]]
+
+
+def _other_text(text: str) -> str:
+    """A text without its last word; a single word is written backwards, or twice."""
+    head, _, _ = text.rstrip().rpartition(" ")
+    return head or (text[::-1] if text[::-1] != text else 2 * text)
+
+
+def _other_parts(values: list[ast.expr]) -> Iterator[list[ast.expr]]:
+    """Parts of an f-string: two values exchanged, and another text beside them."""
+    shown = [i for i, one in enumerate(values) if isinstance(one, ast.FormattedValue)]
+    if len(shown) > 1 and ast.dump(values[shown[0]]) != ast.dump(values[shown[-1]]):
+        first, last = shown[0], shown[-1]
+        yield [
+            *values[:first], values[last], *values[first + 1 : last], values[first],
+            *values[last + 1 :],
+        ]  # fmt: skip
+    for i, one in enumerate(values):
+        if isinstance(one, ast.Constant) and any(map(str.isalpha, one.value)):
+            yield [*values[:i], ast.Constant(_other_text(one.value)), *values[i + 1 :]]
+            return
+
+
+def _parts(
+    node: ast.AST, inside: bool = False, said: bool = False
+) -> Iterator[tuple[ast.AST, bool]]:
+    """Nodes whose change a test should see, from outside in; and whether a function has them.
+
+    Args:
+        node: The outermost one.
+        inside: Whether a function has it.
+        said: Whether it is a part of an error, whose text alone is changed.
+    """
+    said = said or isinstance(node, ast.Raise)
+    if not said or isinstance(node, ast.Constant | ast.JoinedStr):
+        yield node, inside
+    if isinstance(node, ast.JoinedStr):
+        return  # the places of its parts are not those of the file
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns", "decorator_list", "type_params"):
             continue
         within = inside or (name == "body" and isinstance(node, ast.FunctionDef | ast.Lambda))
         for part in value if isinstance(value, list) else [value]:
             if isinstance(part, ast.AST) and not _is_silent(part):
-                yield from _parts(part, within)
+                yield from _parts(part, within, said)
 
 
 def _is_silent(node: ast.AST) -> bool:
-    silent = ast.Assert | ast.Raise | ast.Import | ast.ImportFrom | ast.JoinedStr
+    silent = ast.Assert | ast.Import | ast.ImportFrom
     affinity = isinstance(node, ast.Call) and "sched_setaffinity" in ast.unparse(node.func)
     strict = isinstance(node, ast.keyword) and node.arg == "strict"
-    return affinity or strict or isinstance(node, silent)
+    docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    return affinity or strict or docstring or isinstance(node, silent)
 
 
 def mutants(path: str, source: str) -> list[Mutant]:
@@ -116,7 +170,10 @@ def mutants(path: str, source: str) -> list[Mutant]:
             assert place.end_col_offset is not None
             begin = starts[place.lineno - 1] + place.col_offset
             end = starts[place.end_lineno - 1] + place.end_col_offset
-            after = ast.unparse(ast.fix_missing_locations(other))
+            try:
+                after = ast.unparse(ast.fix_missing_locations(other))
+            except ValueError:
+                continue  # an f-string that Python cannot write in one line
             if isinstance(other, ast.expr):
                 after = f"({after})"
             before = text[begin:end].decode()

@@ -1,11 +1,11 @@
 """Would the tests tell? Bugs are put in, one at a time, and the tests that execute them run.
 
-Mutants (`benchmarks.mutants`) are drawn by a seed from all modules of etid, in a copy of the
-working tree. First every file of the ordinary tests runs once, and its executed lines are noted. A
-mutant is then judged by all files that execute its line; one outside of functions, by all files
-that execute any function of the module. What all of them let pass has survived, and so has what no
-test executes. Some mutants are no bug at all; they are counted all the same. They are done in the
-order in which they were drawn: what is done is a fair sample.
+Mutants (`benchmarks.mutants`) of code, tables and texts are drawn by a seed from all modules of
+etid, in a copy of the working tree. First every file of the ordinary tests runs once, and its
+executed lines are noted. A mutant is then judged by all files that execute its line; one outside of
+functions, by all files that execute any function of the module. What all of them let pass has
+survived, and so has what no test executes. Some mutants are no bug at all; they are counted all the
+same. They are done in the order in which they were drawn: what is done is a fair sample.
 
 mutmut wraps every function, which compiled code and checks of types see, and cosmic-ray starts
 Python and JAX anew for each mutant and runs the same tests for all.

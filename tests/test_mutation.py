@@ -6,6 +6,7 @@ import pytest
 
 from benchmarks import mutation
 from benchmarks.__main__ import asked
+from benchmarks.mutants import mutants
 
 
 @pytest.fixture
@@ -22,6 +23,40 @@ def tree(tmp_path):
         "from etid.small import add\n\n\ndef test_sum():\n    assert add(2, 1) == 3\n"
     )
     return root
+
+
+SAID = '''
+"""Nobody tests a docstring."""
+
+
+def said(name, size):
+    """Nor this one."""
+    if size:
+        raise ValueError(f"{name} has {size} rows")
+    return ("name", "two words"), {"a": name, "b": size}, ["x", "x"]
+'''
+
+
+def test_mutants_of_texts_and_columns():
+    found = [(one.kind, one.before, one.after) for one in mutants("m.py", SAID)]
+    texts = [change for kind, *change in found if kind == "text"]
+    assert texts == [
+        ['f"{name} has {size} rows"', "(f'{size} has {name} rows')"],
+        ['f"{name} has {size} rows"', "(f'{name} sah {size} rows')"],
+        ['"name"', "('eman')"],
+        ['"two words"', "('two')"],
+        ['"a"', "('aa')"],
+        ['"b"', "('bb')"],
+        ['"x"', "('xx')"],
+        ['"x"', "('xx')"],
+    ]
+    columns = [after for kind, _, after in found if kind == "columns exchanged"]
+    assert columns == [
+        "(({'a': name, 'b': size}, ('name', 'two words'), ['x', 'x']))",
+        "(('two words', 'name'))",
+        "({'a': size, 'b': name})",
+    ]
+    assert {kind for kind, *_ in found} == {"text", "columns exchanged", "condition negated"}
 
 
 @pytest.mark.slow
