@@ -194,7 +194,7 @@ def two_named(study):
         (
             lambda study: [study["calibration/98k8"]],
             ["--method", "steiglitz_mcbride"],
-            'order="auto" needs maximum likelihood',
+            "order 'auto' needs maximum likelihood",
         ),
     ],
 )

@@ -290,7 +290,7 @@ def linked(place, of):
 
 STRUCTURE = [
     (attribute("s01/dry", "trial", [1, 2]), "s01/dry", "Write 3 labels"),
-    (attribute("s01/dry", "trial", "a"), "s01/dry", "trial: has 1 labels"),
+    (attribute("s01/dry", "trial", "a"), "s01/dry", "trial: has 1 label"),
     (attribute("/", "kind", "loaded"), "/", "root of a file cannot be a recording"),
     (attribute(KNOWN, "r_load", None), KNOWN, "r_load: is missing"),
     (attribute(KNOWN, "calibration", KNOWN), KNOWN, "a calibration recording must not have it"),
@@ -522,7 +522,7 @@ def test_a_study_without_its_calibration_is_not_written(path, tmp_path):
 
 def test_recordings_that_cannot_be_read_are_not_dropped_by_writing(edit, tmp_path):
     with hdf5.read(edit(attribute(DAMP, "sample_rate", None))) as study:
-        with pytest.raises(RecordingError, match="1 recordings of the study cannot be read"):
+        with pytest.raises(RecordingError, match="1 recording of the study cannot be read"):
             study.write(tmp_path / "a.h5")
         Study.from_recordings(study.recordings()).write(tmp_path / "a.h5")
     assert hdf5.check(tmp_path / "a.h5") == []

@@ -126,7 +126,7 @@ SHOWN = {
     ),
     "recording": (lambda: study()["s01/dry"], ["s01/dry", "200000 Hz", "<b>"]),
     "study": (study, ["1 calibration, 1 loaded"]),
-    "selection": (lambda: Selection.of({0: fit()}, 0, [DRY]), ["1 candidates: successful"]),
+    "selection": (lambda: Selection.of({0: fit()}, 0, [DRY]), ["1 candidate: successful"]),
     "candidate": (
         lambda: Selection.of({0: fit()}, 0, [DRY]).candidates[0],
         ["Candidate SkinRC", "100.0 %", "r_s 33.40 ± 0.10 kΩ"],

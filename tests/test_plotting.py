@@ -215,7 +215,7 @@ def test_fits_are_by_any_two_labels():
 
 def test_a_bound_shows_per_cent_and_what_is_undetermined():
     (axis,) = figure_of(pictures.bounds()).axes
-    assert "1 of 2 recordings leave an element undetermined" in title(axis)
+    assert "undetermined elements (100 % or more) in 1 of 2 recordings" in title(axis)
     points = [line for line in axis.lines if line.get_marker() != "None"]
     noisy = [(np.asarray(line.get_xdata()), line.get_markerfacecolor()) for line in points[1::2]]
     assert [round(size.item()) for size, _ in noisy] == [40, 2, 300]

@@ -81,7 +81,7 @@ etid.register(etid.SteiglitzMcBride(iterations=3)) -> is the name of SteiglitzMc
 etid.identify_amplitudes([of.alone], circuit=Twice()) -> 2 resistors that depend on their current
 etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 2.0]) -> shape
 etid.identify_impedance([0.0, 2.0, 3.0], [1.0, 2.0, 3.0]) -> frequency must be
-etid.identify_impedance([1.0, 2.0, 3.0], [1.0, np.nan, 3.0]) -> 1 impedances are not finite
+etid.identify_impedance([1.0, 2.0, 3.0], [1.0, np.nan, 3.0]) -> 1 impedance of 3 not finite
 etid.identify_impedance([1.0], [1.0]) -> cannot determine 3 elements
 etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 0.0, 3.0]) -> impedance is 0
 dataclasses.replace(of.fit, method='output_error').posterior(of.skin, of.driver)

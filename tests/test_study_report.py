@@ -379,9 +379,9 @@ def test_electrodes_with_a_place_have_a_map_of_each_element_above_their_folded_t
     assert cli.main(["report", str(file), "--layout", str(places)]) == 0
     page = (tmp_path / "fits.html").read_text("utf-8")
     drawn = re.findall(r'alt="Maps of (\w+)', page)
-    assert drawn == ["r_s", "r_p", "c_p"]
+    assert drawn == ["R_s", "R_p", "C_p"]
     assert "2 of 3 maps are drawn" in page
-    assert page.index("Maps of c_p") < page.index("<summary>Table of 2 rows</summary>")
+    assert page.index("Maps of C_p") < page.index("<summary>Table of 2 rows</summary>")
 
 
 def test_the_table_of_few_subjects_is_not_folded(page):
@@ -409,7 +409,7 @@ def test_one_recording_gives_a_page_about_one_recording(tmp_path):
     assert "One recording, loaded/0, identified as Resistor" in text
     assert "The load is the circuit Resistor, Z_L = R." in text
     assert "186.0 ± 4.2" in text
-    for of_others in ("Subjects", "Between recordings", "Worst fits", "r_s"):
+    for of_others in ("Subjects", "Between recordings", "Worst fits", "r_s", "R_s"):
         assert of_others not in text
 
 

@@ -59,6 +59,12 @@ def number(value: float, form: str) -> str:
     return format(value, form) if math.isfinite(value) else "-"
 
 
+def as_symbol(name: str) -> str:
+    """An element as people write it, such as `R_s` for `r_s`; a word such as `alpha` stays."""
+    letter, _, index = name.partition("_")
+    return name if len(letter) > 1 else "_".join(filter(None, (letter.upper(), index)))
+
+
 def heading(name: str, unit: str, value: float = np.nan) -> str:
     """Name and scaled unit of a parameter of about this value [SI], such as `r_s [kΩ]`."""
     symbol = scaled(unit, value)[1]
@@ -84,6 +90,33 @@ def plus_minus(value: float, error: float) -> str:
     return f"{value:10.{digits}f} ± {error:<9.{digits}f}"
 
 
+def significant(value: float, digits: int = 2) -> str:
+    """A number with `digits` significant digits, such as `970`; empty if it is not finite.
+
+    From 1e6 on and below 1e-6 it is a power of ten.
+    """
+    if not math.isfinite(value):
+        return ""
+    rounded = f"{value:.{digits - 1}e}"
+    if abs(value) >= 1e6 or 0 < abs(value) < 1e-6:
+        return rounded
+    decimals = max(0, digits - 1 - int(rounded.partition("e")[2]))
+    return f"{float(rounded):.{decimals}f}" if value else "0"
+
+
+def rounded(value: float, digits: int = 2) -> str:
+    """A number for a sentence: as `significant`, without zeros at the end; a dash for none."""
+    text = significant(value, digits)
+    if "e" in text:
+        return f"{value:.{digits}g}"
+    return (text.rstrip("0").rstrip(".") if "." in text else text) or "-"
+
+
+def per_cent(part: float, digits: int = 2) -> str:
+    """A part of 1 in per cent, such as `0.33 %`."""
+    return f"{rounded(100 * part, digits)} %"
+
+
 def between(low: float, high: float, unit: str) -> str:
     """Both ends of an interval in the scaled unit, such as `33.29 … 33.61 kΩ`.
 
@@ -97,14 +130,20 @@ def between(low: float, high: float, unit: str) -> str:
     return f"{low / scale:.{digits}f} … {high / scale:.{digits}f} {symbol}".rstrip()
 
 
-def unexplained(rrse: float) -> str:
-    """A root relative squared error; an estimate that diverges predicts nothing."""
-    return f"RRSE {100 * rrse:.3g} %" if math.isfinite(rrse) else "no finite prediction"
+def quality(rrse: float, chi2: float = math.nan) -> str:
+    """A root relative squared error, and χ² if it is finite.
+
+    An estimate that diverges predicts nothing.
+    """
+    parts = [f"RRSE {per_cent(rrse, 3)}" if math.isfinite(rrse) else "no finite prediction"]
+    return ", ".join([*parts, f"chi2 {rounded(chi2, 3)}"][: 1 + math.isfinite(chi2)])
 
 
-def several(count: int, noun: str) -> str:
-    """A number of things, such as `1 recording` or `2 recordings`."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+def several(count: int | str, noun: str) -> str:
+    """A number of things, such as `1 recording`, `2 recordings` or `3 frequencies`."""
+    if str(count) == "1":
+        return f"1 {noun}"
+    return f"{count} {noun[:-1]}ies" if noun.endswith("cy") else f"{count} {noun}s"
 
 
 def first_of(names: Sequence[str], most: int) -> str:

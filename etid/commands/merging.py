@@ -3,6 +3,7 @@
 import argparse
 import pathlib
 
+from etid.circuits.display import several
 from etid.commands import Outcome
 from etid.recordings.hdf5 import merge_files
 from etid.recordings.replacing import HDF5
@@ -22,7 +23,7 @@ def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]
 def run(arguments: argparse.Namespace) -> Outcome:
     """Merge the files, and return how many recordings came from each."""
     counts = merge_files(arguments.source, arguments.target)
-    lines = [f"{group}: {count} recordings" for group, count in counts.items()]
+    lines = [f"{group}: {several(count, 'recording')}" for group, count in counts.items()]
     data = {
         "source": arguments.source,
         "target": arguments.target,

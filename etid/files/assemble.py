@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from etid.circuits.display import rounded, several
 from etid.files.channel import UNITS, Channel, located, parse_unit
 from etid.files.clock import sample_rate
 from etid.files.mapping import KINDS, PAUSES, Plan, Signal
@@ -67,7 +68,7 @@ class Imported:
     def __str__(self) -> str:
         ends = self.paths if len(self.paths) < 3 else (self.paths[0], self.paths[-1])
         lines = [
-            f"{' … '.join(ends)}: {self.samples} samples at {self.sample_rate:.9g} Hz "
+            f"{' … '.join(ends)}: {several(self.samples, 'sample')} at {self.sample_rate:.9g} Hz "
             f"({self.rate_by}), pulses at {self.pulse_rate:.9g} Hz"
         ]
         return "\n".join([*lines, *self.channels, *self.notes])
@@ -134,7 +135,7 @@ def sources_of(
     if stacked and len(trials) > length and periods < 0.1:  # it must be transposed
         raise RecordingError(
             f"{plan.signals['v_out'].channel!r} would be {len(trials)} trials of {length} samples, "
-            f"{periods:.2g} pulse periods each",
+            f"{rounded(periods)} pulse periods each",
             field="v_out",
             remedy="Rows are trials, columns are times: transpose the variables",
         )
@@ -193,7 +194,7 @@ def _calibrations(of: Metadata, known: Mapping[str, Metadata]) -> tuple[str, ...
         found = [one.path for one in under if own == {n: getattr(one, n) for n in differing}]
         if under and not found:
             raise RecordingError(
-                f"none of the {len(under)} calibrations in {name!r} has its "
+                f"none of the {several(len(under), 'calibration')} in {name!r} has its "
                 + ", ".join(f"{label} {value!r}" for label, value in own.items()),
                 path=of.path,
                 field="calibration",
@@ -259,7 +260,8 @@ def _parts(
     parts = split(samples(cause), *rates, more, cut=not order)
     if order and len(parts) % len(order):
         raise RecordingError(
-            f"names {len(order)} electrodes, but the record has {len(parts)} trains of pulses",
+            f"names {several(len(order), 'electrode')}, but the record has "
+            f"{several(len(parts), 'train')} of pulses",
             field="electrode",
             remedy="Name them in the order in which they fire, and record whole rounds",
         )
@@ -358,5 +360,8 @@ def _labels(said: Any, trials: list[int], stacked: bool) -> list[Any]:
         return list(trials) if stacked else [""]
     labels = said if isinstance(said, list) else [said]
     if len(labels) != len(trials):
-        raise RecordingError(f"has {len(labels)} labels for {len(trials)} trials", field="trial")
+        raise RecordingError(
+            f"has {several(len(labels), 'label')} for {several(len(trials), 'trial')}",
+            field="trial",
+        )
     return labels

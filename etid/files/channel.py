@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from etid.circuits.display import first_of
+from etid.circuits.display import first_of, several
 from etid.recordings import errors, limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import unwritable
@@ -72,7 +72,8 @@ class Channel:
         object.__setattr__(self, "unit", unit)
         if self.length < self.declared:
             raise RecordingError(
-                f"{self.name!r} has {self.length} samples, the file declares {self.declared}",
+                f"{self.name!r} has {several(self.length, 'sample')}, "
+                f"the file declares {self.declared}",
                 remedy="Copy or record it again; if this part is enough, correct the number in it",
             )
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from etid.circuits.display import rounded
 from etid.files.channel import Channel, located
 from etid.files.mapping import Plan
 from etid.recordings.recording import RecordingError
@@ -91,8 +92,8 @@ def _clock(time: Channel, factor: float, length: int) -> float:
         # The rounding of a printed time must pass, a missing or repeated sample (1) must not.
         if not distance[worst] <= 0.25:
             raise RecordingError(
-                f"is not uniform: sample {start + worst} is wrong by {distance[worst]:.2g} sample "
-                "periods",
+                f"is not uniform: sample {start + worst} is wrong by "
+                f"{rounded(distance[worst])} sample periods",
                 field="time",
                 remedy="Resample the data, or give the sample_rate of the instrument instead",
             )

@@ -58,8 +58,8 @@ class ImportedFolder:
             said += [f"{labels[n] / 1e3:g} kΩ" for n in labels if n == "r_load"]
             paths = [path for one in of for path in one.paths]
             where = paths[0] + (f" … {paths[-1]}" if len(paths) > 1 else "")
-            samples = " or ".join(dict.fromkeys(str(one.samples) for one in of))
-            lines.append(f"{file} → {where}: {', '.join(said)}; {samples} samples")
+            sizes = " or ".join(dict.fromkeys(str(one.samples) for one in of))
+            lines.append(f"{file} → {where}: {', '.join(said)}; {several(sizes, 'sample')}")
             lines += dict.fromkeys(note for one in of for note in one.notes)
             for line in dict.fromkeys(line for one in of for line in one.channels):
                 files_of.setdefault(line, []).append(file)
@@ -192,7 +192,7 @@ def labelled(
         )
     if not found:
         raise RecordingError(
-            f"none of its {len(files)} files matches {' or '.join(map(repr, patterns))}",
+            f"none of its {several(len(files), 'file')} matches {' or '.join(map(repr, patterns))}",
             file=str(root),
             field="labels",
             remedy="Write the names as they are, with labels in braces"

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.circuits.display import several
 from etid.circuits.lookup import circuit, is_circuit_string
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import Known
@@ -100,7 +101,8 @@ def check_alike(field: str, recordings: Sequence[Recording]) -> None:
 
     def of(one: Recording) -> str:
         size = one.samples["v_out"].stored.size
-        return f"{size} samples, sample_rate {one.sample_rate} Hz, pulse_rate {one.pulse_rate} Hz"
+        rates = f"sample_rate {one.sample_rate} Hz, pulse_rate {one.pulse_rate} Hz"
+        return f"{several(size, 'sample')}, {rates}"
 
     for number, one in enumerate(recordings):
         if of(one) != of(recordings[0]):

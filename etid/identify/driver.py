@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from etid.circuits.display import rounded
 from etid.estimators.estimator import AbstractEstimator, serving
 from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
 from etid.estimators.registry import Method
@@ -113,7 +114,8 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     rough = [of_calibrations.rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
     if max(rough) > of_calibrations.ROUGHLY * min(rough):
         shown = ", ".join(
-            f"{one.recording.path!r} {z / 1e3:.3g} kΩ" for one, z in zip(seen, rough, strict=True)
+            f"{one.recording.path!r} {rounded(z / 1e3, 3)} kΩ"
+            for one, z in zip(seen, rough, strict=True)
         )
         text = f"calibrations show impedances of about {shown}: resistors_disagree. "
         raise IdentificationError(text + message("resistors_disagree"), None)

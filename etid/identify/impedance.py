@@ -28,6 +28,7 @@ import scipy
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import several
 from etid.identify.arguments import circuit_of
 from etid.identify.kramers_kronig import EXACT, FAIL, MISFIT_CHI2, kramers_kronig
 from etid.numpy_tier.tiers import program
@@ -223,12 +224,14 @@ def identify_impedance(
             f"frequency has shape {f.shape} and impedance {z.shape}; both must be (n,)"
         )
     if 2 * f.size <= len(structure.names()):
-        raise ValueError(f"{f.size} impedances cannot determine {len(structure.names())} elements")
+        given, wanted = several(f.size, "impedance"), several(len(structure.names()), "element")
+        raise ValueError(f"{given} cannot determine {wanted}")
     for name, values in {"frequency": f, "stderr": sigma}.items():
         if values is not None and not (np.isfinite(values).all() and (values > 0).all()):
             raise ValueError(f"{name} must be finite and > 0 everywhere")
     if not np.isfinite(z).all():
-        raise ValueError(f"{np.sum(~np.isfinite(z))} impedances are not finite; leave them out")
+        bad = several(int(np.sum(~np.isfinite(z))), "impedance")
+        raise ValueError(f"{bad} of {z.size} not finite; fit the others")
     if sigma is None and not z.all():
         raise ValueError("impedance is 0 somewhere; leave it out, or give stderr")
     rising = np.argsort(f, kind="stable")  # neighbours are compared

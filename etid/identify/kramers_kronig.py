@@ -20,6 +20,7 @@ import numpy.typing as npt
 import scipy
 from jaxtyping import Complex, Float
 
+from etid.circuits.display import per_cent, rounded, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.precision import in_float64
 
@@ -72,14 +73,18 @@ class KramersKronig(Overviewed):
         at = self.frequency[np.argmax(np.abs(self.residual))]
         verdict = "passed" if self.passed else "not passed"
         rows = [
-            ("largest residual", f"{100 * self.largest:.2g} %", f"at {at:.3g} Hz"),
-            ("rms residual", f"{100 * rms:.2g} %", ""),
+            (
+                "largest residual",
+                per_cent(self.largest),
+                f"at {rounded(at, 3)} Hz",
+            ),
+            ("rms residual", per_cent(rms), ""),
             ("relaxations", str(self.relaxations), ""),
         ]
         if self.chi2 is None:
             noise = f"Without standard errors, no residual may exceed {100 * self.limit:g} %."
         else:
-            rows.append(("chi2", f"{self.chi2:.3g}", f"may reach {self.limit:.3g}"))
+            rows.append(("chi2", rounded(self.chi2, 3), f"may reach {rounded(self.limit, 3)}"))
             noise = "The residuals are compared with the standard errors."
         return Overview(f"Kramers-Kronig test: {verdict}", rows, notes=(noise,))
 
@@ -119,8 +124,8 @@ def kramers_kronig(
     decades = np.log10(f.max() / f.min())
     if f.size < _SPARSE * decades:
         raise ValueError(
-            f"there are {f.size} frequencies in {decades:.2g} decades; the test needs at least "
-            f"{_SPARSE:g} in each"
+            f"{several(f.size, 'frequency')} in {rounded(decades)} decades; the test needs at "
+            f"least {_SPARSE:g} in each"
         )
     # Five in a decade describe any circuit to 0.1 %; four degrees of freedom show a residual.
     most = min(2 * f.size - _COLUMNS - 4, int(5.0 * decades) + 2)

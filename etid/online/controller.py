@@ -52,7 +52,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import number
+from etid.circuits.display import number, rounded, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.unknowns import LoadUnknowns
@@ -106,7 +106,9 @@ class Command(Overviewed):
             )
         ]
         heads = ("electrode", "reason", "amplitude", "charge / nC", "peak / mA")
-        return Overview(f"Command for {self.reason.size} electrodes: {found}", rows, heads)
+        return Overview(
+            f"Command for {several(self.reason.size, 'electrode')}: {found}", rows, heads
+        )
 
 
 class Limits(NamedTuple):
@@ -251,10 +253,10 @@ class Controller(Overviewed, Kept):
             ("current_cap", f"{1e3 * float(self.limits.current_cap):g}", "mA"),
             ("charge_cap", f"{1e9 * float(self.limits.charge_cap):g}", "nC"),
             ("guard", f"{float(self.limits.guard):.3f}", "of the unloaded record"),
-            ("fallback", f"{float(self.limits.fallback):.3g}", "of the unloaded record"),
+            ("fallback", rounded(float(self.limits.fallback), 3), "of the unloaded record"),
             ("worst pulse", f"{1e9 * self.short * float(self.limits.guard):.0f}", "nC"),
         ]
-        return Overview(f"Controller of {self.tracker.electrodes} electrodes", rows)
+        return Overview(f"Controller of {several(self.tracker.electrodes, 'electrode')}", rows)
 
     @in_float64
     def command(

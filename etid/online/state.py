@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from etid.circuits.display import number, several
+from etid.circuits.display import rounded, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import Description
 from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
@@ -140,17 +140,17 @@ class TrackerState(Overviewed, Module):
         names = verdict_names(lanes.result)
         columns = map(np.asarray, (lanes.pulses, lanes.missed, lanes.chi2))
         rows = [
-            (str(at), str(name), str(pulses), str(missed), number(chi2, ".3g"))
+            (str(at), str(name), str(pulses), str(missed), rounded(chi2, 3))
             for at, (name, pulses, missed, chi2) in enumerate(zip(names, *columns, strict=True))
         ]
         notes = ["Tracker.read(state) gives the elements, Tracker.changes(state) the changes."]
         if bool(self.driver_changed):
             notes.insert(0, "The driver has changed: calibrate again.")
         if not int(self.number):
-            return Overview(f"State of {names.size} electrodes before the first pulse")
+            return Overview(f"State of {several(names.size, 'electrode')} before the first pulse")
         return Overview(
-            f"State of {names.size} electrodes after {several(int(self.number), 'pulse')}, "
-            f"the last one: {counted(names)}",
+            f"State of {several(names.size, 'electrode')} after "
+            f"{several(int(self.number), 'pulse')}, the last one: {counted(names)}",
             rows,
             ("electrode", "verdict", "pulses", "missed in a row", "chi2"),
             notes,

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
+from etid.circuits.display import several
 from etid.recordings.errors import RecordingError
 from etid.recordings.untrusted import guarded
 
@@ -51,7 +52,7 @@ def played(
                 file=name,
                 field="v_out",
                 remedy="Store volts as floats (electrode, sample), "
-                f"of {electrodes} electrodes as the display has",
+                f"of {several(electrodes, 'electrode')} as the display has",
             )
     return _paced(name, sample_rate * speed)
 
@@ -104,8 +105,9 @@ def received(line: socket.socket) -> Iterator[Block]:
             first, electrodes, samples = (int(one) for one in np.frombuffer(header, "<i8"))
             if not (0 < electrodes <= LARGEST and 0 < samples <= LARGEST // electrodes):
                 raise ValueError(
-                    f"a block has {electrodes} electrodes and {samples} samples; is its header "
-                    "three little-endian integers of 64 bits?"
+                    f"a block has {several(electrodes, 'electrode')} and "
+                    f"{several(samples, 'sample')}; is its header three little-endian integers of "
+                    "64 bits?"
                 )
             body = stream.read(8 * electrodes * samples)
             if len(body) < 8 * electrodes * samples:
@@ -155,7 +157,9 @@ class Pulses:
         """
         for first, block in blocks:
             if block.shape[0] != self.electrodes:
-                raise ValueError(f"a block has {block.shape[0]} electrodes, not {self.electrodes}")
+                raise ValueError(
+                    f"a block has {several(block.shape[0], 'electrode')}, not {self.electrodes}"
+                )
             if first + block.shape[1] <= self.begin(self.number):
                 self.late += 1
                 continue

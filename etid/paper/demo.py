@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 import etid
-from etid.circuits.display import DISPLAY
+from etid.circuits.display import DISPLAY, as_symbol, several, significant
 from etid.paper.tables import (
     CALIBRATION,
     LABORATORIES,
@@ -41,8 +41,14 @@ from etid.simulation.published import FINGERTIPS, RRSE, TABLE_1, TABLE_4
 
 
 def _number(value: float | np.floating) -> str:
-    """A number with two decimals, or with three digits if it is 10 000 or more."""
+    """A number with two decimals, or with three digits if it is 10 000 or more; a dash for none."""
+    if not np.isfinite(value):
+        return "-"
     return f"{value:.2f}" if abs(value) < 1e4 else f"{value:.3g}"
+
+
+def _span(low: float, high: float) -> str:
+    return f"{significant(low, 3)} to {significant(high, 3)}"
 
 
 def _successes(fits: etid.Fits) -> str:
@@ -64,12 +70,12 @@ def table_fingertips(outcomes: Sequence[Outcome], truth: Truth, condition: str) 
     """Table II (dry) or III (damp): elements and errors of a typical fingertip and ten subjects."""
     rows = []
     units = etid.SkinRC.units()
-    span = "{:.3g} to {:.3g}".format
     for name in ORDER:
         scale, symbol = DISPLAY[units[name]]
         typical, *limits = (value / scale for value in FINGERTIPS[condition][name])
-        label = f"{name} [{symbol}]"
-        rows.append(("paper", "", label, f"{typical:.3g}", "", "", span(*limits), "", "", ""))
+        label = f"{as_symbol(name)} [{symbol}]"
+        paper = significant(typical, 3), "", "", _span(*limits)
+        rows.append(("paper", "", label, *paper, "", "", ""))
         for outcome in outcomes:
             skins = outcome.skins.where(condition=condition)
             trials = skins.where(subject="typical")
@@ -84,10 +90,10 @@ def table_fingertips(outcomes: Sequence[Outcome], truth: Truth, condition: str) 
             off = 100 * np.abs(medians / actual - 1)
             rows.append((
                 *outcome.names, label,
-                f"{np.median(values) / scale:.4g}",
+                significant(float(np.median(values)) / scale, 4),
                 _number(np.median(error)),
                 _number(np.std(error, ddof=1)),
-                span(medians.min() / scale, medians.max() / scale),
+                _span(medians.min() / scale, medians.max() / scale),
                 _number(np.median(off)),
                 _number(off.max()),
                 _successes(skins),
@@ -112,7 +118,7 @@ def table_4(outcomes: Sequence[Outcome], truth: Truth) -> Table:
         ]
         quality = _number(100 * float(np.median(built.rrse)))
         rows.append((*outcome.names, *cells, quality, _successes(built)))
-    heads = tuple(f"{name} [%]" for name in ORDER)
+    heads = tuple(f"{as_symbol(name)} [%]" for name in ORDER)
     return Table(("records", "method", *heads, "RRSE [%]", "successful"), tuple(rows))
 
 
@@ -129,7 +135,7 @@ def table_verdicts(outcomes: Sequence[Outcome], truth: Truth) -> Table:
             inside = error <= 2 * np.asarray(getattr(good.stderr, name))
             cells.append(f"{100 * inside.mean():.0f} %" if len(good) else "")
         rows.append(tuple(cells))
-    heads = tuple(f"{name} ± 2 se" for name in ORDER)
+    heads = tuple(f"{as_symbol(name)} ± 2 se" for name in ORDER)
     return Table(("records", "method", "driver", "skins and built circuit", *heads), tuple(rows))
 
 
@@ -195,7 +201,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         scene.simulate(seed=0).write(place / "study.h5")
         with etid.read(place / "study.h5") as study:
             for method in METHODS:
-                print(f"{laboratory}: {len(study)} recordings by {method} …", file=sys.stderr)
+                print(
+                    f"{laboratory}: {several(len(study), 'recording')} by {method} …",
+                    file=sys.stderr,
+                )
                 outcome = identify(laboratory, study, method, progress=sys.stderr.isatty())
                 ending = "" if method == "maximum_likelihood" else f"_{method}"
                 outcome.skins.write(place / f"fits{ending}.h5")
@@ -225,7 +234,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         ),
         Section(
             "Table IV: the built circuit",
-            "Mean error / scatter of 23 trials.",
+            "Mean error / scatter of 23 trials. A dash: the estimate predicts no finite voltage.",
             (table_4(outcomes, truth),),
         ),
         Section(

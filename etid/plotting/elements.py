@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import DISPLAY
+from etid.circuits.display import DISPLAY, several
 from etid.plotting.style import (
     BLUE,
     COLOURS,
@@ -105,7 +105,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
     axes[-1].set_xlabel(by[0])
     _legend(axes, list(map(plain, series)), "" if good.all() else "without success")
-    lines = [f"{len(fits)} fits: {counted(fits.verdicts)}; bars: one standard error"]
+    lines = [f"{several(len(fits), 'fit')}: {counted(fits.verdicts)}; bars: one standard error"]
     if summary:
         lines.append("thick: medians, and the variation between fits beyond their errors")
     titled(axes[0], lines, good=bool(good.any()))
@@ -141,8 +141,8 @@ def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
     if undetermined:
         axis.axvline(100, color=RED, lw=0.9, ls="--")  # see `Bound.undetermined`
         lines.append(
-            f"{len(undetermined)} of {len(bounds)} recordings leave an element undetermined "
-            "(100 % or more)"
+            f"undetermined elements (100 % or more) in {len(undetermined)} of "
+            f"{several(len(bounds), 'recording')}"
         )
     plain_ticks(axis.xaxis)
     axis.set_xlabel("smallest standard error [%]")
@@ -201,7 +201,9 @@ def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
                 axis.set_xlabel(labels[column])
     grid[0, 0].plot([], [], color=RED, lw=1.2, label="errors of the fit\n(ellipses: 95 %)")
     grid[0, 0].legend(loc="upper left", bbox_to_anchor=(1.02, 1)).set_in_layout(False)
-    title = f"{posterior.weights.size} draws, worth {posterior.effective:.0f}; shaded: 95 %"
+    title = (
+        f"{several(posterior.weights.size, 'draw')}, worth {posterior.effective:.0f}; shaded: 95 %"
+    )
     titled(grid[0, 0], [title])
     return grid.ravel()
 

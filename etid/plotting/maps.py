@@ -6,7 +6,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import LogNorm
 
-from etid.circuits.display import DISPLAY
+from etid.circuits.display import DISPLAY, several
 from etid.plotting.layout import Layout
 from etid.plotting.style import (
     INK,
@@ -74,7 +74,7 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
             verdict = str(fits.verdicts[of & (place == one)][0])
             at, mark = (1e3 * layout.x[one], 1e3 * layout.y[one]), marks.get(verdict, "x")
             axis.plot(*at, mark, ms=6, color=INK, mfc="white")
-        count = f"{shown.size} of {shown.size + failed.size} electrodes"
+        count = f"{shown.size} of {several(shown.size + failed.size, 'electrode')}"
         name = ", ".join(plain(one).replace(" ", NO_BREAK) for one in group if one)
         titled(axis, [name, count], beside=True)
     for axis in axes.flat[len(groups) :]:

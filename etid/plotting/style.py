@@ -25,7 +25,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from etid.circuits.display import heading
+from etid.circuits.display import heading, rounded
 from etid.recordings.replacing import replacing
 from etid.results.data import AnyAxes, Size
 from etid.results.driver import Driver
@@ -288,9 +288,9 @@ def judged(axis: Axes, path: str, found: Fit | Driver, *more: str) -> None:
     good = found.verdict == "successful"
     words = [found.verdict if good else f"no success: {found.verdict}"]
     if np.isfinite(chi2 := float(found.chi2)):
-        words.append(f"chi2 {chi2:.3g}")
+        words.append(f"chi2 {rounded(chi2, 3)}")
     if np.isfinite(rrse := float(found.rrse)):
-        words.append(f"RRSE {100 * rrse:.3g} %")
+        words.append(f"RRSE {rounded(100 * rrse, 3)} %")
     words = [one.replace(" ", NO_BREAK) for one in words]
     headline = ": ".join(filter(None, [plain(path), ", ".join(words)]))
     titled(axis, [headline, *more], good=good)

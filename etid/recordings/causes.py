@@ -5,7 +5,7 @@ import logging
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import several
+from etid.circuits.display import rounded, several
 from etid.recordings.preflight import Inspected
 from etid.signals.pulse_train import lags_of, shifted, whole_lag
 
@@ -48,8 +48,8 @@ def why_rates_differ(inspected: Inspected) -> str:
     between = inspected.spacing * (inspected.train.edges.size - 1)
     ppm = float(f"{1e6 * abs(inspected.apart) / between:.1g}")  # the edges tell no more
     return (
-        f"The last pulse of v_out is {abs(inspected.apart):.2g} samples {word} from the first than "
-        f"that of v_th: their clocks differ by about {ppm:g} ppm."
+        f"The last pulse of v_out is {rounded(abs(inspected.apart))} samples {word} from "
+        f"the first than that of v_th: their clocks differ by about {ppm:g} ppm."
     )
 
 
@@ -65,8 +65,8 @@ def why_misaligned(inspected: Inspected) -> str:
     ratio = float(np.std(inspected.v_out) / np.std(inspected.v_th))
     if ratio > 30:  # they are not only in the wrong order
         return (
-            f"v_out is {ratio:.3g} times as large as v_th. Their units or scales differ; is one of "
-            "them in mV and the other in V?"
+            f"v_out is {rounded(ratio, 3)} times as large as v_th. Their units or scales "
+            "differ; is one of them in mV and the other in V?"
         )
     reversed_lag = _lag(inspected, -inspected.v_out)
     if inspected.correlated is None and reversed_lag is not None and abs(reversed_lag) <= 1:
@@ -104,7 +104,8 @@ def _why_no_power(inspected: Inspected) -> str:
             continue
         causes = []
         if late:
-            size = f"{abs(late)} samples ({abs(late) / inspected.recording.sample_rate:.3g} s)"
+            seconds = abs(late) / inspected.recording.sample_rate
+            size = f"{several(abs(late), 'sample')} ({seconds:.3g} s)"
             word = "late" if late > 0 else "early"
             causes.append(f"v_out is {word} by {size}; shift one of the two records.")
         if sign < 0:

@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
+from etid.circuits.display import several
 from etid.recordings import limits, schema
 from etid.recordings.errors import near_miss
 from etid.recordings.fields import SIGNALS, Field, Metadata, metadata_from, tidy_path
@@ -146,7 +147,8 @@ class Scan:
         for name, record in recording.samples.items():
             count = int(np.sum(~np.isfinite(record.stored)))
             if count:
-                message = f"{count} of {record.stored.size} samples are not finite"
+                are = "is" if count == 1 else "are"
+                message = f"{count} of {record.stored.size} samples {are} not finite"
                 remedy = "Record again; a fit of this recording only gives a verdict"
                 self._report(path, name, message, remedy)
         with self._reported(path):
@@ -374,9 +376,9 @@ class Scan:
         trials = found.pop("trial", None)
         trials = (trials,) if isinstance(trials, str) else trials
         if trials is not None and len(trials) != (out[0] if stacked else 1):
-            wanted = f"{out[0]} labels, one per row" if stacked else "one label"
+            wanted = f"{several(out[0], 'label')}, one per row" if stacked else "one label"
             raise RecordingError(
-                f"has {len(trials)} labels", field="trial", remedy=f"Write {wanted}"
+                f"has {several(len(trials), 'label')}", field="trial", remedy=f"Write {wanted}"
             )
         found.pop("kind")
         if not stacked and trials:

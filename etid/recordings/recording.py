@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from jaxtyping import Float
 
-from etid.circuits.display import SYMBOLS
+from etid.circuits.display import SYMBOLS, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import RecordingError as RecordingError
 from etid.recordings.errors import located, not_recorded
@@ -289,7 +289,8 @@ class Recording(Overviewed, AbstractFields):
         size = self.samples["v_out"].stored.size
         return (
             f"<Recording {self.path!r}: {load}, {size} samples at {self.sample_rate:g} Hz, "
-            f"{self.periods:.4g} periods of {self.pulse_rate:g} Hz{', ' if labels else ''}{labels}>"
+            f"{several(f'{self.periods:.4g}', 'period')} of {self.pulse_rate:g} Hz"
+            f"{', ' if labels else ''}{labels}>"
         )
 
 

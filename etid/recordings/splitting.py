@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from etid.circuits.display import several
 from etid.recordings.errors import RecordingError
 from etid.signals.pulse_train import find_pulses
 
@@ -54,7 +55,7 @@ def split(
         trains = _trains(edges, period)
         if len(trains) < 2:
             raise RecordingError(
-                f"has {edges.size} pulses without a pause between them",
+                f"has {several(edges.size, 'pulse')} without a pause between trains",
                 field="v_th",
                 remedy="Name a trigger channel, or do not split the record",
             )

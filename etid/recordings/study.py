@@ -183,7 +183,8 @@ class Study(Overviewed, Mapping[str, Recording]):
         rows = [name for name in self._sources if name.startswith(f"{tidy}/")]
         if rows:
             raise KeyError(
-                f"{path!r} is a group of {len(rows)} recordings: {rows[0]!r} … {rows[-1]!r}"
+                f"{path!r} is a group of {several(len(rows), 'recording')}: "
+                f"{rows[0]!r} … {rows[-1]!r}"
             )
         near = difflib.get_close_matches(tidy, self._sources, n=3)
         known = ", ".join(repr(name) for name in near or list(self._sources)[:3])
@@ -253,7 +254,7 @@ class Study(Overviewed, Mapping[str, Recording]):
         """
         if self.problems:
             raise RecordingError(
-                f"{len(self.problems)} recordings of the study cannot be read",
+                f"{several(len(self.problems), 'recording')} of the study cannot be read",
                 file=self.file,
                 remedy="Remove them with Study.from_recordings(study.recordings())",
             )

@@ -4,6 +4,7 @@ import contextlib
 
 import numpy as np
 
+from etid.circuits.display import as_symbol
 from etid.identify.driver import with_harmonics
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
@@ -42,7 +43,9 @@ def budgets(found: StudyFits, study: Study | None) -> list[Section]:
         "elements by this size, and is in no standard error."
     )
     rows_shown = tuple(map(tuple, budget._overview().rows))
-    return [Section("Budget", text, (Table(("source", *budget.names), rows_shown),))]
+    return [
+        Section("Budget", text, (Table(("source", *map(as_symbol, budget.names)), rows_shown),))
+    ]
 
 
 def _of(found: StudyFits, study: Study, row: int, path: str) -> Budget | None:

@@ -11,6 +11,7 @@ import hashlib
 import importlib.resources
 import os
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import jinja2
@@ -40,6 +41,17 @@ class Table:
     searchable: bool = False
     folded: bool = False
     links: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def __str__(self) -> str:
+        columns, at, over = [], 0, ""
+        for cells in zip(self.columns, *self.rows, strict=True):
+            left, width = not columns or self.texts[len(columns)], max(map(len, cells))
+            columns.append([cell.ljust(width) if left else cell.rjust(width) for cell in cells])
+        for name, span in self.groups:
+            over = f"{over:{sum(len(cells[0]) + 2 for cells in columns[:at])}}{name}"
+            at += span
+        lines = ("  ".join(line).rstrip() for line in zip(*columns, strict=True))
+        return "\n".join([*filter(None, [self.caption, over]), *lines])
 
     @property
     def texts(self) -> list[bool]:
@@ -94,6 +106,12 @@ class Section:
     warning: str = ""
     details: str = ""
     code: str = ""
+
+    def __str__(self) -> str:
+        paragraphs = [self.warning, *self.text.split("\n\n"), *self.details.split("\n\n")]
+        filled = (textwrap.fill(one, 100) for one in paragraphs)
+        parts = [f"{self.heading}\n{'=' * len(self.heading)}", *filled, *map(str, self.tables)]
+        return "\n\n".join(filter(None, [*parts, self.code]))
 
     @property
     def anchor(self) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import etid.identify.amplitudes
 import etid.identify.jointly
 import etid.online.state  # these modules describe their methods
-from etid.circuits.display import quantity, several
+from etid.circuits.display import as_symbol, quantity, several
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, described
@@ -79,7 +79,7 @@ def _facts(
         candidates = ", ".join(sorted(settings.candidates))
         units = fits.circuit.units().items()
         typical = ", ".join(
-            f"{name} {quantity(value, unit)}"
+            f"{as_symbol(name)} {quantity(value, unit)}"
             for (name, unit), value in zip(units, settings.start, strict=True)
         )
     conditions = [c for one in used for c in one.conditions]

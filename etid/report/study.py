@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import several
+from etid.circuits.display import as_symbol, several
 from etid.plotting.layout import FINGERTIP, Layout
 from etid.plotting.style import listed
 from etid.precision import in_float64
@@ -116,7 +116,7 @@ def summary(found: StudyFits) -> str:
             return f"{text}without success: {fits.verdicts[0]}."
         return f"{text}identified as {kind} by {method}."
     source = pathlib.Path(settings.source).name if settings is not None else ""
-    text = f"{len(fits)} recordings{f' of {source}' if source else ''}"
+    text = f"{several(len(fits), 'recording')}{f' of {source}' if source else ''}"
     for name, field in DESCRIBING.items():
         column = fits.labels[name]
         if field.type == "number":
@@ -190,8 +190,8 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
         Picture(
             f"Part of the successful fits below a value, for {shown} (number of fits).",
             figures.distributions(fits),
-            f"Distribution functions of {', '.join(units)} by condition; quantiles are in the "
-            "table.",
+            f"Distribution functions of {', '.join(map(as_symbol, units))} by condition; quantiles "
+            "are in the table.",
             whole=True,
         ),
         Picture(
@@ -255,9 +255,10 @@ def _electrodes(fits: Fits, layout: Layout) -> list[Section]:
         text += f" {figures.MAPS} of {count} maps are drawn; etid.plot(fits, map=…) draws others."
     pictures = tuple(
         Picture(
-            f"{name} at each electrode; an electrode without success has the mark of its verdict.",
+            f"{as_symbol(name)} at each electrode; an electrode without success has the mark of "
+            "its verdict.",
             figures.electrodes(shown, name, layout),
-            f"Maps of {name} by subject, session, site and condition.",
+            f"Maps of {as_symbol(name)} by subject, session, site and condition.",
             whole=True,
         )
         for name in fits.circuit.units()

@@ -12,7 +12,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from etid.circuits.display import between, first_of, heading, plus_minus, scaled
+from etid.circuits.display import (
+    as_symbol,
+    between,
+    first_of,
+    heading,
+    plus_minus,
+    scaled,
+    significant,
+)
 from etid.recordings.fields import LABELS
 from etid.report.html import Table
 from etid.results.driver import ContinuousDriver, Driver
@@ -22,18 +30,6 @@ from etid.results.verdicts import message, own_part
 ROWS = 100  # largest number of rows of a table
 CONDITIONS = 30  # largest number of conditions in a table
 SINGLE = 3000  # largest number of rows of the table of recordings
-
-
-def significant(value: float, digits: int = 2) -> str:
-    """A number with `digits` significant digits; empty if it is not finite."""
-    if not math.isfinite(value):
-        return ""
-    if abs(value) >= 1e6 or 0 < abs(value) < 1e-4:
-        return f"{value:.{digits - 1}e}"
-    shown = np.format_float_positional(
-        value, precision=digits, min_digits=digits, fractional=False, trim="k"
-    )
-    return shown.removesuffix(".") if value else "0"
 
 
 def element(value: float, error: float, scale: float) -> str:
@@ -184,7 +180,7 @@ def show_components(found: Sequence[Components], units: Mapping[str, str]) -> Ta
         rows.append(
             (
                 one.condition or "all",
-                heading(one.name, units[one.name], one.median),
+                heading(as_symbol(one.name), units[one.name], one.median),
                 str(one.subjects),
                 str(one.successful),
                 significant(one.median / scale, 4),
@@ -228,7 +224,7 @@ def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[
     heads = [*by, "successful"]
     for name, unit in units.items():
         heads += [heading("median", unit, usual[name]), *(f"{part} [%]" for part in parts)]
-    over = [(name, 1 + len(parts)) for name in units]
+    over = [(as_symbol(name), 1 + len(parts)) for name in units]
     return Table(tuple(heads), tuple(cells), (("", len(by) + 1), *over))
 
 
@@ -261,7 +257,7 @@ def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
     for name, unit in units.items():
         usual = _typical(columns[name])
         scales[name] = scaled(unit, usual)[0]
-        heads.append(heading(name, unit, usual))
+        heads.append(heading(as_symbol(name), unit, usual))
     rows = []
     for i, verdict in enumerate(some.verdicts):
         rows.append(
@@ -290,5 +286,5 @@ def single(fits: Fits) -> Table:
         error = float(np.asarray(getattr(fits.stderr, name))[0])
         scale = scaled(unit, value)[0]
         parts = (significant(float(part[i]) / scale) for part in (own, shared))
-        rows.append((heading(name, unit, value), element(value, error, scale), *parts))
+        rows.append((heading(as_symbol(name), unit, value), element(value, error, scale), *parts))
     return Table(("element", "value ± standard error", "own error", "shared error"), tuple(rows))

@@ -7,13 +7,13 @@ import pathlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from etid.circuits.display import significant
 from etid.plotting import figure_of
 from etid.plotting.style import svg
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.report.html import Picture, Section
-from etid.report.tables import significant
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.results.fits import Fits

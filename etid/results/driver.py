@@ -13,7 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.circuits.display import number, plus_minus, several, unexplained
+from etid.circuits.display import per_cent, plus_minus, quality, rounded, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.numpy_tier.tiers import program
 from etid.precision import Module
@@ -98,14 +98,14 @@ class Calibration(Overviewed, Module):
     def _overview(self) -> Overview:
         open_delay = float(self.delay_std_samples)
         rows = [
-            (f"{float(ohm) / 1e3:g} kΩ", f"{float(delay):.3g}")
+            (f"{float(ohm) / 1e3:g} kΩ", rounded(float(delay), 3))
             for ohm, delay in zip(self.r_load, self.delay_samples, strict=True)
         ]
         return Overview(
             several(len(rows), "calibration"),
             rows,
             ("resistor", "trigger delay [samples]"),
-            [f"One delay of all is open: ± {number(open_delay, '.2g')} samples."],
+            [f"One delay of all is open: ± {rounded(open_delay)} samples."],
         )
 
 
@@ -217,7 +217,7 @@ class Driver(AbstractFeed):
     def _numbers(self) -> str:
         """A sentence with the numbers that explain the verdict; empty if there are none."""
         if self.verdict == "misfit":
-            return f"chi2 is {float(self.chi2):.3g}; noise alone gives 1."
+            return f"chi2 is {rounded(float(self.chi2), 3)}; noise alone gives 1."
         if self.verdict == "implausible":
             return f"|Z_th| is {abs(self._at_1_khz()):.4g} ohm at 1 kHz."
         return ""
@@ -236,7 +236,7 @@ class Driver(AbstractFeed):
         notes = [*self._findings(), *([message(verdict)] if verdict != "successful" else [])]
         return Overview(
             f"Driver of order {self.order}: {verdict} in {several(int(self.steps), 'step')} "
-            f"({self.method}), {unexplained(float(self.rrse))}, chi2 {float(self.chi2):.3g}",
+            f"({self.method}), {quality(float(self.rrse), float(self.chi2))}",
             rows,
             notes=[*notes, *texts(int(self.remarks))],
         )
@@ -349,7 +349,7 @@ class ContinuousDriver(Driver):
             return []
         return [
             f"r_load {float(r) / 1e3:.6g} kΩ is {100 * float(np.expm1(off)):+.3g}"
-            f" ± {100 * float(error):.2g} % off what the others say"
+            f" ± {per_cent(float(error))} off what the others say"
             for r, off, error in zip(known.r_load, *known.mismatch, strict=True)
         ]
 

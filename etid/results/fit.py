@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import Circuit
-from etid.circuits.display import quantity, several, unexplained
+from etid.circuits.display import quality, quantity, rounded, several
 from etid.circuits.overview import Overview, element_rows
 from etid.precision import Module
 from etid.recordings.remarks import texts, words
@@ -167,6 +167,11 @@ class Limited(Module):
             end = quantity(float(bound[row]), unit)
             found.append(f"{name} would be {abs(by):.1f} standard errors {where} {end}")
         return f"Without bounds, {' and '.join(found)}." if found else ""
+
+
+def _signed(value: float) -> str:
+    """A number with two significant digits and its sign."""
+    return ("+" if value >= 0 else "") + rounded(value)
 
 
 class Fit(Judged, HasSource[Circuit]):
@@ -337,7 +342,7 @@ class Fit(Judged, HasSource[Circuit]):
         if self.change is None or self.change_stderr is None:
             return ""
         return "During the record: " + ", ".join(
-            f"{name} {100 * float(size):+.2g} ± {100 * float(error):.1g} %"
+            f"{name} {_signed(100 * float(size))} ± {rounded(100 * float(error), 1)} %"
             for name, size, error in zip(
                 (*self.circuit.names(), "amplitude"), self.change, self.change_stderr, strict=True
             )
@@ -347,7 +352,7 @@ class Fit(Judged, HasSource[Circuit]):
     def missed(self) -> str:
         """A sentence on the test that a `misfit` has failed, with its size; for one fit."""
         looks = "" if self.support is None else self.support.looks_like()
-        return looks or f"chi2 is {float(self.chi2):.3g}; noise alone gives 1."
+        return looks or f"chi2 is {rounded(float(self.chi2), 3)}; noise alone gives 1."
 
     @property
     def other_circuit(self) -> str:
@@ -389,9 +394,8 @@ class Fit(Judged, HasSource[Circuit]):
             return Overview(batch, rows)
         method, told = self._told
         title = f"{kind}: {verdict} in {several(int(self.steps), 'step')} ({method})"
-        title += f", {unexplained(float(self.rrse))}"
-        if self.measured is None or self.measured.stderr is not None:
-            title += f", chi2 {float(self.chi2):.3g}"  # without standard errors there is none
+        known = self.measured is None or self.measured.stderr is not None  # else there is no chi2
+        title += f", {quality(float(self.rrse), float(self.chi2) if known else np.nan)}"
         outside = "" if verdict == "out_of_bounds" else self.outside
         notes = [*filter(None, [told, *self._reasons, outside]), *texts(int(self.remarks))]
         return Overview(title, rows, notes=notes)

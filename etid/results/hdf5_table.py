@@ -8,6 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from etid.circuits.display import several
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import check_ending, replacing_hdf5
@@ -196,7 +197,7 @@ def check_same_length(table: Table, columns: Mapping[str, np.ndarray | h5py.Data
     for name, size in sizes.items():
         if size != first:
             raise RecordingError(
-                f"has {size} rows, {next(iter(sizes))} has {first}",
+                f"has {several(size, 'row')}, {next(iter(sizes))} has {first}",
                 file=table.name,
                 field=name,
                 remedy=REMEDY,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from etid.circuits.display import per_cent
 from etid.circuits.overview import Overview, Overviewed
 from etid.precision import Module
 
@@ -161,5 +162,5 @@ class Budget(Overviewed):
         shown["together"] = self.together
         for source, change in self.unstated.items():
             shown[f"if {_named(source, BUDGETED[source])}"] = change
-        rows = [(name, *(f"± {100 * of:.2g} %" for of in part)) for name, part in shown.items()]
+        rows = [(name, *(f"± {per_cent(of)}" for of in part)) for name, part in shown.items()]
         return Overview("Budget of the standard errors", rows, ("", *self.names))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.circuit import Circuit
-from etid.circuits.display import between, quantity
+from etid.circuits.display import between, quantity, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.solvers.importance_sampling import effective
 
@@ -80,7 +80,7 @@ class Posterior(Overviewed, Generic[Circuit]):
             notes.append(
                 "The draws represent the distribution badly; draw more, as in draws=10_000."
             )
-        title = f"Posterior of {type(self.draws).__name__}: {self.weights.size} draws, "
+        title = f"Posterior of {type(self.draws).__name__}: {several(self.weights.size, 'draw')}, "
         title += f"worth {self.effective:.0f}"
         return Overview(title, rows, ("", "median", "95 % interval", "fit"), notes)
 
@@ -134,4 +134,4 @@ class Profile(Overviewed):
             ("95 % interval", between(*self.interval(), self.unit)),
             ("fit", quantity(self.value, self.unit, self.stderr)),
         ]
-        return Overview(f"Profile of {self.name}: {self.values.size} values", rows)
+        return Overview(f"Profile of {self.name}: {several(self.values.size, 'value')}", rows)

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import several
+from etid.circuits.display import rounded, several
 from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.precision import in_float64
 from etid.recordings.recording import RecordingError
@@ -138,7 +138,12 @@ class StudyFits(Overviewed):
 
     def _overview(self) -> Overview:
         rows = [
-            (", ".join(paths), str(driver.order), driver.verdict, f"{float(driver.chi2):.3g}")
+            (
+                ", ".join(paths),
+                str(driver.order),
+                driver.verdict,
+                rounded(float(driver.chi2), 3),
+            )
             for paths, driver in itertools.islice(self.drivers.items(), ROWS)
         ]
         failed = dict(self.failures) | {

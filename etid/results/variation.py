@@ -18,7 +18,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from etid.circuits.display import quantity
+from etid.circuits.display import per_cent, quantity, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.fields import LABELS, check_names
 from etid.results.fits import Fits
@@ -74,7 +74,8 @@ class Variation(Overviewed):
         rows.append(("error of a fit", _per_cent(self.error), "", ""))
         of = f"each {self.driver}" if self.driver else "all"
         rows.append((f"error of the driver of {of}", _per_cent(self.driver_error), "", ""))
-        title = f"{self.element} of {self.fits} fits: {quantity(self.mean, self.unit, self.stderr)}"
+        title = f"{self.element} of {several(self.fits, 'fit')}: "
+        title += quantity(self.mean, self.unit, self.stderr)
         heads = "variation", "standard deviation", "95 % from", "to"
         names = ", ".join(self.unused)
         notes = [f"no groups of several fits by {names}"] if names else []
@@ -82,7 +83,7 @@ class Variation(Overviewed):
 
 
 def _per_cent(part: float) -> str:
-    return f"{100 * part:.0f} %" if part >= 1 else f"{100 * part:.2g} %"
+    return f"{100 * part:.0f} %" if part >= 1 else per_cent(part)
 
 
 def variation(
@@ -125,7 +126,9 @@ def variation(
     s, a = (np.sqrt(np.maximum(of, 0.0)) / values for of in (own, shared))
     levels = _levels([good.labels[name].astype(str) for name in by], by, len(values))
     if len(values) < 2 or not levels:
-        raise ValueError(f"{len(values)} successful fits show no variation by {', '.join(by)}")
+        raise ValueError(
+            f"no variation by {', '.join(by)} in {several(len(values), 'successful fit')}"
+        )
     names = good.labels[driver].astype(str) if driver else np.zeros(y.size)
     member = (names[:, None] == np.unique(names)).astype(float)
     # One error for a driver: that of each fit grows with its element, and would explain it.

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
@@ -133,7 +134,7 @@ class Selection(Overviewed):
             notes.append(message(self.fit.verdict))
         if self.residual:
             notes.append(self.residual)
-        title = f"{self.candidates[0].name} of {total} candidates: {self.fit.verdict}"
+        title = f"{self.candidates[0].name} of {several(total, 'candidate')}: {self.fit.verdict}"
         return Overview(title, [one.row for one in self.candidates], HEADS, notes)
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
+from etid.circuits.display import per_cent
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.identify.arguments import require
 from etid.precision import in_float64
@@ -68,7 +69,7 @@ class Bound(Overviewed):
 
     def _rows(self) -> list[tuple[str, ...]]:
         elements = element_rows(self.circuit.units(), np.asarray(self.circuit.values()))
-        return [(*row, f"± {100 * self.relative[row[0]]:.2g} %") for row in elements]
+        return [(*row, f"± {per_cent(self.relative[row[0]])}") for row in elements]
 
     def _overview(self) -> Overview:
         rows = self._rows()

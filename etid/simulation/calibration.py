@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from etid.circuits.circuit import Resistor, SkinRC
-from etid.circuits.display import several
+from etid.circuits.display import per_cent, rounded, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.identify.arguments import check_new
 from etid.identify.driver import identify_driver
@@ -60,12 +60,12 @@ class CheckedCalibration(Overviewed):
 
     def _overview(self) -> Overview:
         records = [
-            (one.path, f"{(one.r_load or 0.0) / 1e3:g} kΩ", f"{1e3 * noise:.2g} mV")
+            (one.path, f"{(one.r_load or 0.0) / 1e3:g} kΩ", f"{rounded(1e3 * noise)} mV")
             for one, noise in zip(self.driver.recordings, self.noise, strict=True)
         ]
         heads = ("calibration", "resistor", "noise of V_out")
         rows = [
-            (skin, what, *(f"{100 * error:.2g} %" for error in errors.values()))
+            (skin, what, *(per_cent(error) for error in errors.values()))
             for skin, by in self.expected.items()
             for what, errors in by.items()
         ]
@@ -90,7 +90,7 @@ class CheckedCalibration(Overviewed):
         then, what = min(
             (errors[name], what) for what, errors in self.expected[skin].items() if what != NOW
         )
-        text = f"{name} of {skin} skin is least known; {what} helps most: {100 * then:.2g} %"
+        text = f"{name} of {skin} skin is least known; {what} helps most: {per_cent(then)}"
         times = np.ceil((error / GOAL) ** 2)
         return [text + (f"; 1 % takes {times:.0f} times as many periods" if times > 1 else "")]
 

@@ -23,6 +23,7 @@ from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 
+from etid.circuits.display import several
 from etid.files.channel import Contents, one_unit, parse_unit, rate_of, spooled, with_unit
 from etid.recordings.recording import RecordingError
 
@@ -157,7 +158,8 @@ def _rows(
                 )
             if any(cells[width:]) or len(cells) < least:
                 raise RecordingError(
-                    f"line {number} has {len(cells)} cells; the table has {width} columns, and "
+                    f"line {number} has {several(len(cells), 'cell')}; the table has "
+                    f"{several(width, 'column')}, and "
                     f"numbers in {least} of them",
                     remedy="Correct or remove this line; copy the file again if it is the last one",
                 )
@@ -213,7 +215,8 @@ def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Co
         width = max(number for number, name in enumerate(names, 1) if name)
         count, notice = spool(path, dialect, skipped, width, places)
         if length > count:  # an oscilloscope may have written a part of its record
-            return f"the table has {count} rows, its preamble declares {length:g} samples"
+            found = several(count, "row")
+            return f"the table has {found}, its preamble declares {length:g} samples"
         return notice
 
     def about(name: str) -> dict[str, Any]:

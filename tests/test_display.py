@@ -1,0 +1,68 @@
+"""Numbers, plurals and names as people read them."""
+
+import pytest
+
+from etid.circuits.display import as_symbol, per_cent, quality, rounded, several, significant
+from etid.report.html import Section, Table
+
+
+@pytest.mark.parametrize(
+    ("value", "shown", "in_a_sentence"),
+    [
+        (970.0, "970", "970"),  # it was 9.7e+02
+        (8.3e-5, "0.000083", "0.000083"),
+        (0.12, "0.12", "0.12"),
+        (1.0, "1.0", "1"),
+        (99.99, "100", "100"),
+        (-3.456, "-3.5", "-3.5"),
+        (0.0, "0", "0"),
+        (2e7, "2.0e+07", "2e+07"),
+        (float("nan"), "", "-"),
+    ],
+)
+def test_a_number_has_two_digits_and_no_power_of_ten(value, shown, in_a_sentence):
+    assert (significant(value), rounded(value)) == (shown, in_a_sentence)
+
+
+def test_three_digits_are_three():
+    assert [significant(value, 3) for value in (0.12, 0.14, 1234.0)] == ["0.120", "0.140", "1230"]
+    assert per_cent(9.7) == "970 %"
+
+
+def test_one_thing_is_no_several():
+    assert [several(n, "recording") for n in (0, 1, 2)] == [
+        "0 recordings", "1 recording", "2 recordings",
+    ]  # fmt: skip
+    assert (several(1, "frequency"), several("3.5", "frequency")) == (
+        "1 frequency",
+        "3.5 frequencies",
+    )
+
+
+def test_what_diverges_predicts_nothing():
+    assert quality(1e-3, 1.02) == "RRSE 0.1 %, chi2 1.02"
+    assert quality(float("inf"), float("nan")) == "no finite prediction"
+
+
+def test_elements_are_named_as_in_figures():
+    names = ("r_s", "r_p", "c", "alpha_2", "q_2")
+    assert [*map(as_symbol, names)] == ["R_s", "R_p", "C", "alpha_2", "Q_2"]
+
+
+def test_a_section_is_printed_as_text_and_tables():
+    """The demo printed `Section(heading=…` in place of its tables."""
+    table = Table(
+        ("subject", "successful", "median [kΩ]", "own [%]"),
+        (("s01", "9/10", "33.4", "1.2"), ("typical", "10/10", "186", "")),
+        (("", 2), ("R_s", 2)),
+        "Medians",
+    )
+    section = Section("Skins", "One paragraph.\n\nAnother one.", (table,))
+    assert str(section) == (
+        "Skins\n=====\n\nOne paragraph.\n\nAnother one.\n\n"
+        "Medians\n"
+        "                     R_s\n"
+        "subject  successful  median [kΩ]  own [%]\n"
+        "s01            9/10         33.4      1.2\n"
+        "typical       10/10          186"
+    )
