@@ -1,5 +1,6 @@
 """Derivatives through a fit: implicit, against differences of fits and against what must be."""
 
+import contextlib
 import dataclasses
 
 import equinox as eqx
@@ -9,10 +10,14 @@ import numpy as np
 import pytest
 
 import etid
+from benchmarks.perturbed_study import drawn_driver
 from etid.estimators.maximum_likelihood import search
-from etid.results.driver import ContinuousDriver
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.identify import samples
+from etid.results.driver import ContinuousDriver, HarmonicDriver
+from etid.signals.noise import noise
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
+from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 from etid.solvers import successive
 
 # Minima to ten digits: a difference of two of them is to be compared.
@@ -57,3 +62,89 @@ def test_a_resistor_follows_the_data_and_the_known_resistor_one_to_one(monkeypat
     np.testing.assert_allclose((by_data + also) / 2, numeric, rtol=1e-4, atol=REPEATED / STEP)
     _, by_resistor = derivative(v_out, r_load, 0 * v_out, r_load)
     np.testing.assert_allclose(by_resistor, 1.0, atol=1e-4)  # the weak prior of Z_th is in ohm
+
+
+@pytest.mark.slow
+def test_derivatives_by_both_records_are_differences_of_fits(monkeypatch):
+    """In directions of white noise, whose effect is a standard error, with the noise held.
+
+    A derivative of the estimate of the noise would count: it is that of a median, and so far off.
+    """
+    monkeypatch.setattr(search, "WELL", EXACT)
+    monkeypatch.setattr(successive, "BEFORE", 1e-6)
+    held = []
+
+    def known(v, step):
+        """The noise of the unmoved record, with the derivative of the estimate."""
+        found = noise(v, step)
+        return found + jax.lax.stop_gradient(held.pop(0) - found)
+
+    monkeypatch.setattr(samples, "noise", known)
+
+    @jax.jit
+    def derivative(records, sigma, driver, direction):
+        """The logarithms of the elements, their derivatives and standard errors."""
+
+        def log_elements(v_th, v_out):
+            held[:] = sigma
+            fit = etid.identify_samples(v_th, v_out, driver, sample_rate=200e3, pulse_rate=60.0)
+            values = fit.circuit.values()
+            return jnp.log(values), jnp.sqrt(jnp.diagonal(fit.cov)) / values
+
+        return jax.jvp(log_elements, tuple(records), tuple(direction), has_aux=True)
+
+    skin = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+    for number, snr_db in enumerate((40.0, 60.0, 40.0)):
+        of = drawn_driver(number, 0.1, TransformerDriver())
+        trials = (Trial("a", skin),), (Trial("c", ResistorLoad(98.8e3)),)
+        study = Scene(*trials, driver=of, snr_db=snr_db).simulate(seed=number)
+        driver = etid.identify_driver(study["c"], order=5, throw=False)
+        driver = jax.tree.map(jnp.asarray, driver)  # one program for all
+        records = np.stack([study["a"].v_th, study["a"].v_out])
+        sigma = [float(noise(record, np.zeros(()))) for record in records]
+        for which in range(2):
+            white = np.random.default_rng([number, which]).standard_normal(10_000)
+            direction = np.zeros_like(records)
+            direction[which] = sigma[which] * white
+            (up, by_up, errors), (down, by_down, _) = (
+                derivative(records + step * direction, jnp.array(sigma), driver, direction)
+                for step in (0.05, -0.05)
+            )
+            difference = np.asarray((up - down) / 0.1 / errors)
+            assert np.abs(difference).max() > 0.1  # the direction matters
+            # The mean of both derivatives; what is left are 6e-3, of the curvature of a step.
+            found = np.asarray((by_up + by_down) / 2 / errors)
+            np.testing.assert_allclose(found, difference, rtol=0.0, atol=0.01)
+
+
+def test_what_is_estimated_before_a_fit_is_held(monkeypatch):
+    """Noise, and what aliases add to it; three periods of 334 samples join aliases and harmonics.
+
+    The records themselves are not held.
+    """
+    lanes = []
+
+    def seen(lane, *_):
+        lanes.append(lane)
+        raise InterruptedError  # its fit is not needed
+
+    monkeypatch.setattr(samples, "skin_lane", seen)
+    pulses = 100.0 * (np.arange(1002) % 334 < 14)
+    records = jnp.asarray(pulses + np.random.default_rng(0).standard_normal((2, 1002)))
+    driver = object.__new__(HarmonicDriver)  # whose numbers nobody reads
+
+    for name in ("known", "check_driver"):
+        monkeypatch.setattr(MaximumLikelihood, name, lambda *_: None)
+
+    def arrays(v_th, v_out):
+        with contextlib.suppress(InterruptedError):
+            etid.identify_samples(v_th, v_out, driver, sample_rate=334.0, pulse_rate=1.0)
+        one = lanes.pop()
+        return one.variance_x, one.variance_y, one.x, one.y
+
+    _, slopes = jax.jvp(arrays, tuple(records), tuple(records))
+    of_x, of_y, x, y = slopes
+    assert not np.any(of_x)
+    assert not np.any(of_y)
+    assert np.any(x)
+    assert np.any(y)

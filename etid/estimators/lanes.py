@@ -169,8 +169,11 @@ class Harmonics(AbstractLane):
         fields = map(jnp.asarray, filled(both, sigma, m.sample_rate, *periods))
         frequency, x, y, of_x, of_y, selected = fields
         if joins_aliases(*periods):
-            of_x = of_x + aliases(x, of_x, *periods).variance
-            of_y = of_y + aliases(y, of_y, *periods).variance
+            # As the noise, they are no data of the fit: derivatives by the records hold them.
+            of_x, of_y = (
+                of + jax.lax.stop_gradient(aliases(record, of, *periods).variance)
+                for record, of in ((x, of_x), (y, of_y))
+            )
         return cls(frequency, x, y, of_x, of_y, selected, m.sample_rate)
 
     @property

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -37,7 +38,8 @@ def identify_samples(
     The elements are differentiable with respect to both records and to every number in `driver`,
     for example its resistors `driver.calibration.r_load`. The derivatives come from implicit
     differentiation of the minimum. They are as accurate as the minimum itself: a thousandth of a
-    standard error. There is no pre-flight, but there is a verdict.
+    standard error. What is estimated before the fit is held: the noise of both records, and the
+    choice of harmonics. There is no pre-flight, but there is a verdict.
 
     Args:
         v_th: Unloaded voltage [V].
@@ -68,7 +70,8 @@ def identify_samples(
     v_th, v_out, step, rate = (
         jnp.asarray(value, float) for value in (v_th, v_out, resolution, sample_rate)
     )
-    of_th, of_out = (jnp.asarray(noise(v, step)) for v in (v_th, v_out))
+    # The noise is a median: by its derivative, few samples would have most of the weight.
+    of_th, of_out = (jax.lax.stop_gradient(jnp.asarray(noise(v, step))) for v in (v_th, v_out))
     lane = estimator.lane.of_samples(Measurement(v_th, v_out, of_th, of_out, rate), periods)
     known = (
         estimator.known(driver, jnp.asarray(lane.frequency), True)

@@ -266,7 +266,7 @@ def aliases(
     signals, errors = [], []
     for low, high in (LOWER, UPPER):
         inside = (position >= low) & (position < high)
-        count = max(np.count_nonzero(inside), 1)
+        count = float(max(np.count_nonzero(inside), 1))
         noise = xp.sum(xp.where(inside, variance, 0.0)) / count
         signals.append(xp.sum(xp.where(inside, squares, 0.0)) / count - noise)
         errors.append(noise / np.sqrt(count))
