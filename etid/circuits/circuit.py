@@ -250,8 +250,8 @@ class SkinCole(AbstractCircuit):
 class SkinLayers(AbstractCircuit):
     """Skin of two layers, each one relaxation, Z = R_s + R_1/(1 + s R_1 C_1) + R_2/(1 + s R_2 C_2).
 
-    With the typical values, the first layer is the faster layer. The sum of the typical resistances
-    equals that of `SkinRC`. The typical time constants are 21 and 120 µs. Birlea, Birlea and Culea
+    The first layer is the faster one, in all fits. The sum of the typical resistances equals that
+    of `SkinRC`. The typical time constants are 21 and 120 µs. Birlea, Birlea and Culea
     measured 10 to 40 and 100 to 200 µs in human skin (The Skin's Electrical Time Constants, 2011,
     doi 10.1007/978-3-642-22586-4_34).
     """

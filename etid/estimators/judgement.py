@@ -8,9 +8,11 @@ data, the data do not determine the parameters.
 import dataclasses
 
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from etid.circuits.branches import exchangeable, in_order
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.element_prior import ElementPrior
@@ -67,8 +69,10 @@ def judged(
 ) -> Fit:
     """The fit of an estimate of the logarithms of the elements, with its verdict.
 
-    Bounds of elements that the circuit lacks do not count. Elements that `prior` fixes are exact.
+    Branches that can be exchanged get their order. Bounds of elements that the circuit lacks do not
+    count. Elements that `prior` fixes are exact.
     """
+    estimate = ordered(estimate, circuit, bounds, prior)
     fitted = circuit.with_log_values(estimate.parameters)
     values = fitted.values()
     errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so they are relative
@@ -114,6 +118,35 @@ def judged(
         remarks=remarks(estimate) + at_bound,
         support=support or Support.unknown(values.size),
         limits=limited(circuit, own, outside),
+    )
+
+
+def places_of(
+    estimate: Estimate, circuit: AbstractCircuit, bounds: Limits, prior: ElementPrior | None
+) -> Int[Array | np.ndarray, " element"]:
+    """Places of the elements in the order of their branches (`etid.circuits.branches`)."""
+    limits = {name: ends for name, *ends in bounds}
+    ends = np.array([limits.get(name, (0.0, np.inf)) for name in circuit.names()])
+    told = () if prior is None else (prior.told, prior.width)
+    return in_order(circuit, estimate.parameters, *told, *ends.T)
+
+
+def ordered(
+    estimate: Estimate, circuit: AbstractCircuit, bounds: Limits, prior: ElementPrior | None
+) -> Estimate:
+    """The estimate, with branches that can be exchanged in their order."""
+    if not exchangeable(type(circuit)):
+        return estimate
+    places = places_of(estimate, circuit, bounds, prior)
+    support = estimate.support
+    if support is not None:
+        support = dataclasses.replace(support, spread_slope=support.spread_slope[places])
+    return dataclasses.replace(
+        estimate,
+        parameters=estimate.parameters[places],
+        cov=estimate.cov[places][:, places],
+        shared_cov=estimate.shared_cov[places][:, places],
+        support=support,
     )
 
 

@@ -27,6 +27,7 @@ import optimistix as optx
 import scipy
 from jaxtyping import Array, Complex, Float
 
+from etid.circuits.branches import in_order
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several
 from etid.identify.arguments import circuit_of
@@ -101,6 +102,8 @@ def _fit(
     else:
         cov, excess = _judged(residual(q, None), jax.jacfwd(residual)(q, None), passive)
         misfit, remark = excess > FAIL, jnp.where(excess > EXACT, int(Remark.not_noise), 0)
+    places = in_order(circuit, q)
+    q, cov = q[places], cov[places][:, places]
     fitted = circuit.with_log_values(q)
     values = fitted.values()
     settled = solution.result == optx.RESULTS.successful

@@ -148,7 +148,9 @@ def _together(
         of_model = METHOD, model.bounds, model.prior
         fit = judgement.judged(found.estimate, model.circuit, driver.result, *of_model)
         if driver.instrument is not None:
-            fit = dataclasses.replace(fit, by_tolerance=by_tolerance(found.by_error.T))
+            places = judgement.places_of(found.estimate, model.circuit, model.bounds, model.prior)
+            by_error = found.by_error[places]
+            fit = dataclasses.replace(fit, by_tolerance=by_tolerance(by_error.T))
         fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)
         return judgement.unless(fit, found.other, RESULTS.misfit)
 
