@@ -118,8 +118,9 @@ def _other_parts(values: list[ast.expr]) -> Iterator[list[ast.expr]]:
             *values[last + 1 :],
         ]  # fmt: skip
     for i, one in enumerate(values):
-        if isinstance(one, ast.Constant) and any(map(str.isalpha, one.value)):
-            yield [*values[:i], ast.Constant(_other_text(one.value)), *values[i + 1 :]]
+        text = one.value if isinstance(one, ast.Constant) else None
+        if isinstance(text, str) and any(map(str.isalpha, text)):
+            yield [*values[:i], ast.Constant(_other_text(text)), *values[i + 1 :]]
             return
 
 
