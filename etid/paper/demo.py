@@ -39,6 +39,14 @@ from etid.recordings.replacing import replace_text
 from etid.report.html import Picture, Section, Table, write_page
 from etid.simulation.published import FINGERTIPS, RRSE, TABLE_1, TABLE_4
 
+ABOUT = (
+    "Rows and columns named paper are measurements of the paper. All other numbers come from "
+    "simulated recordings, whose true elements are known. Quiet records have a signal-to-noise "
+    "ratio of 60 dB and no trigger delay. Noisy records have 40 dB and 200 ns; the errors of "
+    "the paper's method then have about the published size. The tables include every estimate, "
+    "whatever its verdict; `successful` counts the successful fits."
+)
+
 
 def _number(value: float | np.floating) -> str:
     """A number with two decimals, or with three digits if it is 10 000 or more; a dash for none."""
@@ -177,6 +185,41 @@ def figures(folder: pathlib.Path, study: etid.Study, outcome: Outcome) -> tuple[
     return tuple(drawn)
 
 
+def sections(outcomes: Sequence[Outcome], truth: Truth) -> list[Section]:
+    """The tables of the paper with the results of every laboratory and method."""
+    return [
+        Section(
+            "Table I: errors of five resistors [%]",
+            "Maximum likelihood identifies one resistor. Steiglitz-McBride identifies eq. 7, whose "
+            "resistance is R_s + R_p.",
+            (table_1(outcomes),),
+        ),
+        *(
+            Section(
+                f"Table {number}: {condition} fingertips",
+                "One typical fingertip: median of ten trials, its error, and the spread between "
+                "the trials. Ten subjects: a median over five trials for each subject; the table "
+                "has the range of these medians, and the median and the maximum of their absolute "
+                "errors.",
+                (table_fingertips(outcomes, truth, condition),),
+            )
+            for number, condition in (("II", "dry"), ("III", "damp"))
+        ),
+        Section(
+            "Table IV: the built circuit",
+            "Mean error / scatter of 23 trials. A dash: the estimate predicts no finite voltage.",
+            (table_4(outcomes, truth),),
+        ),
+        Section(
+            "Verdicts",
+            "The last three columns: percentage of the successful fits whose error is at most two "
+            "standard errors (se). All fits of a study share the error of the driver, so their "
+            "errors are correlated.",
+            (table_verdicts(outcomes, truth),),
+        ),
+    ]
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Simulate, identify, print the tables, and write files, figures and a page.
 
@@ -214,50 +257,13 @@ def main(argv: Sequence[str] | None = None) -> None:
                 drawn = figures(folder / "figures", study, outcomes[0])
     replace_text(folder / "truth.json", json.dumps(truth, indent=1) + "\n")
 
-    sections = [
-        Section(
-            "Table I: errors of five resistors [%]",
-            "Maximum likelihood identifies one resistor. Steiglitz-McBride identifies eq. 7, whose "
-            "resistance is R_s + R_p.",
-            (table_1(outcomes),),
-        ),
-        *(
-            Section(
-                f"Table {number}: {condition} fingertips",
-                "One typical fingertip: median of ten trials, its error, and the spread between "
-                "the trials. Ten subjects: a median over five trials for each subject; the table "
-                "has the range of these medians, and the median and the maximum of their absolute "
-                "errors.",
-                (table_fingertips(outcomes, truth, condition),),
-            )
-            for number, condition in (("II", "dry"), ("III", "damp"))
-        ),
-        Section(
-            "Table IV: the built circuit",
-            "Mean error / scatter of 23 trials. A dash: the estimate predicts no finite voltage.",
-            (table_4(outcomes, truth),),
-        ),
-        Section(
-            "Verdicts",
-            "The last three columns: percentage of the successful fits whose error is at most two "
-            "standard errors (se). All fits of a study share the error of the driver, so their "
-            "errors are correlated.",
-            (table_verdicts(outcomes, truth),),
-        ),
-    ]
-    about = (
-        "Rows and columns named paper are measurements of the paper. All other numbers come from "
-        "simulated recordings, whose true elements are known. Quiet records have a signal-to-noise "
-        "ratio of 60 dB and no trigger delay. Noisy records have 40 dB and 200 ns; the errors of "
-        "the paper's method then have about the published size. The tables include every estimate, "
-        "whatever its verdict; `successful` counts the successful fits."
-    )
-    print(f"\n{textwrap.fill(about, 100)}")
-    for section in sections:
+    print(f"\n{textwrap.fill(ABOUT, 100)}")
+    tables = sections(outcomes, truth)
+    for section in tables:
         print(f"\n{section}")
     page = folder / "index.html"
-    sections.append(Section("Figures", "Quiet records, by maximum likelihood.", pictures=drawn))
-    write_page(page, "The paper's experiments, simulated and identified", about, sections)
+    shown = Section("Figures", "Quiet records, by maximum likelihood.", pictures=drawn)
+    write_page(page, "The paper's experiments, simulated and identified", ABOUT, [*tables, shown])
     print(f"\nTables and figures: {page.resolve()}")
 
 
