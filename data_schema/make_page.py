@@ -1,12 +1,13 @@
 """Write `recording-1.json` and `README.md`: `python data_schema/make_page.py`.
 
 Both come from `etid.recordings.schema`, which takes the fields of a recording from
-`etid.recordings.fields`. The page adds rules and examples.
+`etid.recordings.fields`. The page adds the formats of `etid.files.formats`, rules and examples.
 """
 
 import json
 import pathlib
 
+from etid.files import formats
 from etid.recordings import schema
 from etid.recordings.fields import DECLARED
 
@@ -101,16 +102,7 @@ inside a number. If several files are imported into one, each `[[recording]]` ha
 the name of its file without the folder. A recording without a `path` is then named by its file, as
 in `loaded/finger`.
 
-| file | channels | the file contains | trials | install |
-|---|---|---|---|---|
-| `.csv` | columns, by the first line | units: `open [mV]`, or a second line of them | none | |
-| `.mat` | variables, `a.b` for field b of structure a | nothing | rows | |
-| `.tdms` | `group/channel` | units (`unit_string`), rate (`wf_increment`) | none | `.[tdms]` |
-| `.abf` | ADC channels, or `channel 0`, … | units and rate | sweeps | `.[abf]` |
-| `.npz` | arrays | nothing | rows | |
-| `.wav` | `1`, `2`, …, as fractions of full scale | rate | none | |
-| `.lvm` | columns of LabVIEW, one header per file | units, rate (`Delta_X`) | none | |
-| `.xlsx` | columns; further sheets `sheet/column` | units as in CSV | none | `.[excel]` |
+FORMATS
 
 A table contains its rate if a preamble of an oscilloscope has a `Sample Interval` or an
 `Increment`. In all formats a name such as `open [mV]`, `open (mV)` or `open / mV` contains a unit.
@@ -277,7 +269,13 @@ def as_markdown() -> str:
         parts.append("\n".join(lines) + "\n")
     rates = ("sample_rate", "pulse_rate")  # which have lines of their own
     names = ", ".join(f"`{name}`" for name in DECLARED if name not in rates)
-    return "\n".join([*parts, _RULES, OTHER_FORMATS.replace("FIELDS", names)])
+    return "\n".join(
+        [
+            *parts,
+            _RULES,
+            OTHER_FORMATS.replace("FIELDS", names).replace("FORMATS", formats.as_table()),
+        ]
+    )
 
 
 def write(folder: pathlib.Path) -> None:

@@ -3,10 +3,11 @@ import pytest
 
 import etid
 from etid.cli import main
-from etid.files.folder import import_folder, labelled, resistance
+from etid.files.folder import import_folder, labelled
 from etid.files.importing import import_file
 from etid.files.pattern import pattern
 from etid.recordings.recording import RecordingError
+from etid.recordings.resistance import resistance
 
 OPTIONS = {"v_th": "open", "v_out": "skin", "time": "t", "scale": 0.5, "pulse_rate": 60.0}
 PATTERNS = ("{session}_cal_{r_load}.csv", "{subject}_{session}_{trial}.csv")
@@ -123,7 +124,7 @@ def test_a_label_may_contain_the_letters_of_the_text_before_it():
 
 def test_resistances_are_written_as_in_electronics():
     texts = {"98800": 98.8e3, "98k8": 98.8e3, "98.8k": 98.8e3, "4R7": 4.7, "1M": 1e6}
-    assert {text: resistance(text, "file") for text in texts} == pytest.approx(texts)
+    assert {text: resistance(text) for text in texts} == pytest.approx(texts)
 
 
 @pytest.mark.parametrize(

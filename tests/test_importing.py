@@ -146,7 +146,7 @@ SHIFTED = "t,th,out{0}\n0,1.5,2.5{0}\n{1}\n0,1.5,2.5{0}\n"
         ("th,out\n1,2\n3,\n", {}, "line 3 has '' in column 2"),
         ("th,out\n1,2\n3\n", {}, "line 3 has 1 cells"),
         ("th;out\n1;2\n", {}, "there is no 'th'; the names are 'th;out'"),
-        ("th,out,th\n1,2,3\n", {}, "two channels have the name 'th'"),
+        ("th,out,th\n1,2,3\n", {}, "2 columns have the name 'th'.*: 'th#1' or 'th#3'"),
         ("th,out\n1,2\n\xff", {}, "cannot be read"),
         (times(0, 1, 2, 4, 5), BY_TIME, "time: is not uniform: sample"),
         (times(0, 1, 2, 2, 3), BY_TIME, "time: is not uniform"),

@@ -82,9 +82,9 @@ def test_one_error_proposes_options_for_all_that_is_missing(rig):
     with pytest.raises(RecordingError, match="are not given, and are not guessed") as caught:
         imported(rig)
     assert caught.value.field == "v_th, v_out, pulse_rate, scale"
-    options = "--v-th rig/open --v-out rig/skin --pulse-rate 60 --scale 1; or name the measured"
+    options = "--v-th NAME --v-out NAME --pulse-rate 60 --scale 1; or name the measured"
     assert options in caught.value.remedy
-    with pytest.raises(RecordingError, match=r"as in --v-th rig/open --scale 1; ") as caught:
+    with pytest.raises(RecordingError, match=r"as in --v-th NAME --scale 1; ") as caught:
         imported(rig, v_out="rig/skin", pulse_rate=60.0)
     assert caught.value.field == "v_th, scale"
 

@@ -1,7 +1,4 @@
-"""Convert laboratory files, or a folder of them, to an etid file.
-
-The files may be .csv, .mat, .tdms, .abf, .npz, .wav, .lvm and .xlsx.
-"""
+"""Convert laboratory files, or a folder of them, to an etid file."""
 
 import argparse
 import dataclasses
@@ -11,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from etid.commands import Outcome
+from etid.files import formats
 from etid.files.folder import import_folder
 from etid.files.importing import import_file, resistors
 from etid.files.mapping import CHANNELS, FIELDS
@@ -18,6 +16,8 @@ from etid.files.readers.delimited import DIALECT
 from etid.recordings.errors import RecordingError
 from etid.recordings.fields import DECLARED, SIGNALS
 from etid.recordings.replacing import HDF5
+
+__doc__ = f"{__doc__}\n\nSuffixes of the files: {', '.join(formats.SUFFIXES)}."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar=("FILE", "OHM"),
-        help="file recorded with a known resistor, and its resistance; may be given several times",
+        help="file recorded with a known resistor, and its resistance, such as 98k8; may be given "
+        "several times",
     )
     parser.add_argument(
         "--labels",
@@ -55,12 +56,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(data_schema/README.md)",
     )
     for name, kind, what in (
-        ("delimiter", _delimiter, "character between the cells, default a comma; '\\t': a tab"),
+        ("delimiter", _delimiter,
+         "character between the cells, default a comma; '\\t': a tab; ' ': one or more blanks"),
         ("decimal", str, "decimal sign, default a point"),
         ("header_line", int, "line with the names of the columns, default 1; 0: they are 1, 2, …"),
         ("encoding", str, "encoding of the text, default UTF-8"),
-    ):
-        _option(parser, name, kind, f"for CSV: {what}")
+    ):  # fmt: skip
+        _option(parser, name, kind, f"for tables of text: {what}")
     channel = "channel of {}; its unit is {} unless the file names a unit".format
     for name, signal in SIGNALS.items():
         other = "; FILE:NAME for a channel of another file" if name == "v_th" else ""
@@ -76,8 +78,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name, field in DECLARED.items():
         if field.type in ("number", "label"):
             unit = f" [{field.unit}]" if field.unit else ""
-            kind = float if field.type == "number" else str
-            _option(parser, name, kind, f"{field.description.rstrip('.')}{unit}")
+            # A resistance may be a text such as 98k8.
+            kind = float if field.type == "number" and field.unit != "ohm" else str
+            shape = "OHM" if field.unit == "ohm" else ""
+            _option(parser, name, kind, f"{field.description.rstrip('.')}{unit}", shape)
 
 
 def _option(
@@ -85,8 +89,9 @@ def _option(
     name: str,
     kind: Callable[[str], object] = str,
     help: str = "",
+    metavar: str = "",
 ) -> None:
-    metavar = "NUMBER" if kind in (int, float) else "NAME"
+    metavar = metavar or ("NUMBER" if kind in (int, float) else "NAME")
     parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar=metavar, help=help)
 
 
@@ -106,7 +111,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     folder = os.path.isdir(arguments.source[0]) and arguments.mapping is None
     if folder or arguments.labels:
         return _folder(arguments, given)
-    calibrations = resistors((file, _ohm(file, text)) for file, text in arguments.calibrations)
+    calibrations = resistors(arguments.calibrations)
     used = import_file(
         arguments.source,
         arguments.target,
@@ -145,12 +150,3 @@ def _folder(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Outcome:
 def _delimiter(text: str) -> str:
     r"""The value of --delimiter; a shell passes `'\t'` as two characters."""
     return "\t" if text == r"\t" else text
-
-
-def _ohm(file: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(
-            f"{file}: its resistance is {text!r}, must be a number of ohm, as in 98.8e3"
-        ) from None

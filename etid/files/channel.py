@@ -1,5 +1,6 @@
 """Named channels of a file of another format; their samples are read later."""
 
+import collections
 import contextlib
 import dataclasses
 import functools
@@ -7,7 +8,7 @@ import itertools
 import pathlib
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -126,9 +127,25 @@ def listed(names: Iterable[str]) -> str:
     return first_of([repr(name) for name in names], 30) or "none"
 
 
+def by_place(names: Sequence[str]) -> list[str]:
+    """Names of the columns of a table; those that occur several times tell their place, `CH1#3`."""
+    count = collections.Counter(names)
+    return [
+        f"{name}#{place}" if name and count[name] > 1 else name
+        for place, name in enumerate(names, 1)
+    ]
+
+
 def chosen(names: Iterable[str], name: str, field: str) -> None:
     """Raise an error if a name is missing or occurs twice."""
     every = list(names)
+    alike = [one for one in every if one.rpartition("#")[0] == name]
+    if name and name not in every and len(alike) > 1:
+        raise RecordingError(
+            f"{len(alike)} columns have the name {name!r}",
+            field=field,
+            remedy=f"Name one of them by its place: {' or '.join(map(repr, alike))}",
+        )
     if name not in every:
         raise RecordingError(
             f"there is no {name!r}; the names are {listed(every)}",

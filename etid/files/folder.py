@@ -22,12 +22,13 @@ import tomli_w
 from etid.circuits.display import several
 from etid.files.assemble import Imported
 from etid.files.channel import listed, located
-from etid.files.importing import channels_of, converted
+from etid.files.importing import channels_of, converted, other_file
 from etid.files.mapping import CHANNELS
 from etid.files.pattern import pattern
 from etid.recordings.errors import RecordingError
-from etid.recordings.fields import LABELS, real
+from etid.recordings.fields import LABELS
 from etid.recordings.replacing import replacing
+from etid.recordings.resistance import resistance
 from etid.recordings.tables import rows_of
 
 TABLE = "calibrations.csv"
@@ -87,8 +88,11 @@ def import_folder(
 
     A recording names the calibrations whose labels do not contradict its own as its calibrations:
     with `{session}` in both patterns, those of its session; and of several electrodes in one file,
-    that of its own. Beside the target, the mapping `TARGET.toml` is written: `import_file(FOLDER,
-    target, mapping)` imports the same files again.
+    that of its own. A channel of a further file, `FILE:NAME`, may have labels in the name of this
+    file: `v_th="open_{trial}.csv:CH1"` is in a file for each trial.
+
+    Beside the target, the mapping `TARGET.toml` is written: `import_file(FOLDER, target, mapping)`
+    imports the same files again.
 
     Args:
         folder: Folder of the files; files of folders in it match patterns with a `/`.
@@ -106,8 +110,14 @@ def import_folder(
             cannot be read.
     """
     root = pathlib.Path(os.fspath(folder))
-    found, unmatched = labelled(root, [labels] if isinstance(labels, str) else labels)
     common = channels_of({name: value for name, value in given.items() if value is not None})
+    further = {
+        name: file
+        for name in CHANNELS
+        if name in common and (file := other_file(str(common[name]["channel"]))[0])
+    }
+    patterns = [labels] if isinstance(labels, str) else labels
+    found, unmatched = labelled(root, patterns, [*further.values()])
     turns = {name: common.pop(name) for name in ("split", "electrode") if name in common}
     tables = {file: {**of, "path": _path(of)} for file, of in found.items()}
     for file, of in tables.items():
@@ -116,8 +126,13 @@ def import_folder(
         names = _calibrations(file, of, tables)
         if names:
             of["calibration"] = names
+    for name, text in further.items():
+        if "{" in text:
+            _, channel = other_file(common.pop(name)["channel"])
+            for file, own in _further(root, text, name, found).items():
+                tables[file][name] = {"channel": f"{own}:{channel}"}
     said = {root / file: {**common, **of} for file, of in tables.items()}
-    imported = converted(said, target)
+    imported = converted(said, target, root=root)
     mapping = pathlib.Path(os.fspath(target)).with_suffix(".toml")
     files = {file: [one for one in imported if one.file == str(root / file)] for file in tables}
     _say_units(common, tables, files)
@@ -136,14 +151,14 @@ def _say_units(
 
     They come into the table of each file that names none itself, or into `common` if no file does.
     """
-    for name in [name for name in CHANNELS if name in common]:
+    for name in CHANNELS:
         implied = {
-            file: {**common[name], "unit": one.signals[name].unit}
+            file: {**tables[file].get(name, common.get(name)), "unit": one.signals[name].unit}
             for file, of in files.items()
             for one in of
-            if one.signals[name].unit_by == "command"
+            if name in one.signals and one.signals[name].unit_by == "command"
         }
-        if len(implied) == len(files):
+        if name in common and len(implied) == len(files):
             common[name] = next(iter(implied.values()))
         else:
             for file, channel in implied.items():
@@ -151,9 +166,15 @@ def _say_units(
 
 
 def labelled(
-    root: pathlib.Path, patterns: Sequence[str]
+    root: pathlib.Path, patterns: Sequence[str], further: Sequence[str] = ()
 ) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """Labels of each file of a folder that matches a pattern, and the other files.
+
+    Args:
+        root: The folder.
+        patterns: Patterns of names; the first that matches counts.
+        further: Names or patterns of files with channels of other recordings. They are in neither
+            result.
 
     Raises:
         RecordingError: As `import_folder`.
@@ -163,10 +184,12 @@ def labelled(
     expressions = [pattern(text, ("r_load",)) for text in patterns]
     known = _table(root)
     deep = any("/" in text for text in patterns)
+    others = {path.resolve() for text in further for path in _of_pattern(root, text)}
+    others |= {pathlib.Path(text).resolve() for text in further}
     files = sorted(
         path.relative_to(root).as_posix()
         for path in root.glob("**/*" if deep else "*")
-        if path.is_file() and path.name != TABLE
+        if path.is_file() and path.name != TABLE and path.resolve() not in others
     )
     found: dict[str, dict[str, Any]] = {}
     for file in files:
@@ -175,7 +198,8 @@ def labelled(
             continue
         of: dict[str, Any] = {} if match is None else match.groupdict()
         if "r_load" in of:
-            of["r_load"] = resistance(of["r_load"], str(root / file))
+            with located(str(root / file)):
+                of["r_load"] = _resistor(of["r_load"])
         if file in known:
             named = of.setdefault("r_load", known[file])
             if not math.isclose(named, known[file]):
@@ -202,30 +226,63 @@ def labelled(
     return calibrations_first, [file for file in files if file not in found]
 
 
-def resistance(text: str, file: str, field: str = "r_load") -> float:
-    """Resistance [ohm] of a text such as 98800, 98k8 (IEC 60062) or 98.8k.
+def _of_pattern(root: pathlib.Path, text: str) -> dict[pathlib.Path, dict[str, Any]]:
+    """Labels of the files of a folder that match one pattern, which may be a name without any."""
+    if "{" not in text:
+        return {root / text: {}}
+    expression = pattern(text, ("r_load",))
+    found = {}
+    for path in sorted(root.glob("**/*" if "/" in text else "*")):
+        match = expression.fullmatch(path.relative_to(root).as_posix())
+        if match is not None:
+            found[path] = match.groupdict()
+            if "r_load" in found[path]:
+                with located(str(path)):
+                    found[path]["r_load"] = _resistor(found[path]["r_load"])
+    return found
 
-    Args:
-        text: The text.
-        file: File with this resistor, or the table that lists it.
-        field: The label, or the column of the table.
+
+def _further(
+    root: pathlib.Path, text: str, signal: str, found: Mapping[str, Mapping[str, Any]]
+) -> dict[str, str]:
+    """The further file of each file: the one of a pattern whose labels are its own.
 
     Raises:
-        RecordingError: The text is no resistance.
+        RecordingError: A file has none of its own.
     """
-    written = r"(\d+)([RkM])(\d*)|(\d+(?:\.\d+)?)([RkM]?)"
-    match = re.fullmatch(written, text.removesuffix("ohm"))
-    if match is None:
+    others = _of_pattern(root, text)
+    if not others:
         raise RecordingError(
-            f"is {text!r}, which is no resistance",
-            file=file,
-            field=field,
-            remedy="Write it as 98800, 98k8 or 98.8k"
-            + f", or list the file in {TABLE}" * (field == "r_load"),
+            f"no file of the folder matches {text!r}",
+            file=str(root),
+            field=signal,
+            remedy="Write the name of the further file as seen from the folder",
         )
-    whole, middle, rest, number, last = match.groups()
-    factor = {"": 1.0, "R": 1.0, "k": 1e3, "M": 1e6}[last if middle is None else middle]
-    return factor * float(number or f"{whole}.{rest or 0}")
+    own: dict[str, str] = {}
+    for file, of in found.items():
+        fitting = [path for path, its in others.items() if its.items() <= of.items()]
+        if len(fitting) != 1:
+            labels = re.findall(r"\{(\w+)\}", text)
+            lacking = [label for label in labels if label not in of]
+            raise RecordingError(
+                f"none of the {len(others)} files {text!r} has the {' and '.join(labels)} of this "
+                "file" + f", whose name tells no {' and '.join(lacking)}" * bool(lacking),
+                file=str(root / file),
+                field=signal,
+                remedy="Add the file that is missing, or name the further file of each recording "
+                "in a mapping",
+            )
+        own[file] = fitting[0].relative_to(root).as_posix()
+    return own
+
+
+def _resistor(text: str) -> float:
+    """Resistance [ohm] of a part of a name."""
+    try:
+        return resistance(text)
+    except RecordingError as error:
+        error.remedy += f", or list the file in {TABLE}"
+        raise
 
 
 def _table(root: pathlib.Path) -> dict[str, float]:
@@ -240,10 +297,7 @@ def _table(root: pathlib.Path) -> dict[str, float]:
                 raise RecordingError(
                     f"lists {row['file']!r} twice", field="file", remedy="Keep one of the rows"
                 )
-            try:
-                found[row["file"]] = real("ohm", float(row["ohm"]))
-            except ValueError:
-                found[row["file"]] = resistance(row["ohm"], str(table), "ohm")
+            found[row["file"]] = resistance(row["ohm"], "ohm")
         return found
 
 

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Complex, Float
 
+from etid.files import formats
 from etid.files.assemble import Imported, sources_of
 from etid.files.channel import Channel, Contents, located
 from etid.files.mapping import (
@@ -26,22 +27,11 @@ from etid.files.mapping import (
     read_mapping,
     recordings_of,
 )
-from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
+from etid.files.readers import delimited, npz
 from etid.recordings.errors import optional, require_file
-from etid.recordings.fields import LABELS, Metadata
+from etid.recordings.fields import DECLARED, LABELS, Metadata
 from etid.recordings.recording import AbstractSource, RecordingError, check_rates
 from etid.recordings.study import Study, refuse_nested
-
-READERS = {
-    ".csv": delimited.opened,
-    ".mat": matlab.opened,
-    ".tdms": tdms.opened,
-    ".abf": abf.opened,
-    ".npz": npz.opened,
-    ".wav": wav.opened,
-    ".lvm": lvm.opened,
-    ".xlsx": excel.opened,
-}
 
 
 def import_file(
@@ -49,29 +39,23 @@ def import_file(
     target: str | os.PathLike[str],
     mapping: str | os.PathLike[str] | Mapping[str, Any] | None = None,
     *,
-    calibrations: Mapping[str | os.PathLike[str], float] | None = None,
+    calibrations: Mapping[str | os.PathLike[str], float | str] | None = None,
     **given: Any,
 ) -> list[Imported]:
     """Convert one or several files of other formats into one etid file.
 
-    - `.csv`: comma-separated columns with a header line, one trial.
-    - `.mat`: variables of shape (time,) or (trial, time). `a.b` is field b of structure a.
-    - `.tdms`: channels `group/channel` of NI files. They need the extra `tdms`.
-    - `.abf`: ADC channels of Axon files; sweeps become trials. They need the extra `abf`.
-    - `.npz`: arrays of shape (time,) or (trial, time). If the arrays are those of
-      `etid.files.readers.npz.own_mapping`, the file contains all fields: only labels can be given,
-      without `trial`, and the default condition is the name of the file.
-    - `.wav`: channels `1`, `2`, …, as fractions of full scale.
-    - `.lvm`: channels of a LabVIEW measurement file.
-    - `.xlsx`: columns with a header line; `sheet/column` for the second and further sheets. They
-      need the extra `excel`.
+    The suffix of a file gives its format; data_schema/README.md lists the formats.
+
+    If the arrays of a `.npz` file are those of `etid.files.readers.npz.own_mapping`, the file
+    contains all fields: only labels can be given, without `trial`, and the default condition is the
+    name of the file.
 
     With `split`, one long record becomes several trials: `"pulses"` splits it at the pauses between
     its pulses, the name of a trigger channel at the rising edges of the trigger. Files of
     `calibrations` are not split, and get none of the electrodes of the parts.
 
     A channel may be in another file, as when V_th was recorded once for all trials: `FILE:NAME` is
-    channel `NAME` of `FILE`, a path from the current folder.
+    channel `NAME` of `FILE`, a path from the current folder, or from the folder that is imported.
 
     A channel may be a pattern, as in `v_out="CH{electrode}"`: each channel that matches becomes a
     recording with this label. So a file with a channel for each electrode of an array is imported.
@@ -93,10 +77,11 @@ def import_file(
             may be a folder, which contains the files that the mapping names.
         target: etid file to write. An existing file is replaced.
         mapping: TOML file, or its content as a mapping. It replaces all other arguments.
-        calibrations: More files to import, each with its known resistor, `r_load` [ohm]. All other
-            arguments apply to them too. The other recordings name them as their calibrations.
-        **given: Keys of a mapping for one recording: for CSV, `delimiter`, `decimal`, `header_line`
-            and `encoding` of the table if they are not `,`, `.`, 1 and UTF-8; the channel names
+        calibrations: More files to import, each with its known resistor, `r_load` [ohm], a number
+            or a text such as `98k8`. All other arguments apply to them too. The other recordings
+            name them as their calibrations.
+        **given: Keys of a mapping for one recording: for a table of text, `delimiter`, `decimal`,
+            `header_line` and `encoding` if they are not `,`, `.`, 1 and UTF-8; the channel names
             `v_th`, `v_out`, `current` and `time`; `scale`; and fields such as `pulse_rate` [Hz].
 
     Returns:
@@ -137,17 +122,25 @@ def import_file(
     place = "" if inside else f"{os.fspath(mapping)} of "
     with located(place + str(paths[0])):
         content = mapping if inside else read_mapping(mapping)
-        if len(paths) == 1 and paths[0].is_dir():
+        root = paths[0] if len(paths) == 1 and paths[0].is_dir() else None
+        if root is not None:
             names = files_of(content)
-            paths = [paths[0] / name for name in names]
+            paths = [root / name for name in names]
         else:
             names = [path.name for path in paths]
         tables = of_files(content, names)
-    return converted(dict(zip(paths, tables, strict=True)), target, place=place, by="mapping")
+    said = dict(zip(paths, tables, strict=True))
+    return converted(said, target, place=place, by="mapping", root=root)
+
+
+import_file.__doc__ = (import_file.__doc__ or "").replace(
+    "data_schema/README.md lists the formats.",
+    "the formats are\n\n    " + formats.as_list().replace("\n", "\n    "),
+)
 
 
 def resistors(
-    calibrations: Iterable[tuple[str | os.PathLike[str], float]],
+    calibrations: Iterable[tuple[str | os.PathLike[str], float | str]],
 ) -> dict[pathlib.Path, float]:
     """The known resistor of each file of calibrations [ohm].
 
@@ -159,12 +152,13 @@ def resistors(
         path = pathlib.Path(os.fspath(one))
         if path in known:
             raise RecordingError(
-                f"is given with two resistors, {known[path]} and {r_load} ohm",
+                f"is given with two resistors, {known[path]:.9g} and {r_load} ohm",
                 file=str(path),
                 field="calibrations",
                 remedy="Give each file once, with the resistor with which it was recorded",
             )
-        known[path] = r_load
+        with located(str(path)):
+            known[path] = DECLARED["r_load"].checked(r_load)
     return known
 
 
@@ -181,6 +175,7 @@ def converted(
     *,
     place: str = "",
     by: Literal["command", "mapping", "file"] = "command",
+    root: pathlib.Path | None = None,
 ) -> list[Imported]:
     """Convert files, each with a mapping of its own, into one etid file.
 
@@ -190,6 +185,7 @@ def converted(
         place: Text before the name of a file in errors.
         by: Source of the mappings. Channels that a command names without a unit are in volt,
             ampere or second.
+        root: Folder that is imported, in which further files of channels may be.
 
     Returns:
         Sources of each recording or stack of trials.
@@ -202,7 +198,7 @@ def converted(
         raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
     for path in said:
         require_file(str(path))
-        _check_suffix(path)
+        formats.format_of(path)
     sources: dict[str, AbstractSource] = {}
     used: list[Imported] = []
     calibrations: dict[str, Metadata] = {}
@@ -211,18 +207,18 @@ def converted(
             file = str(path)
             written = {name: table[name] for name in delimited.DIALECT if name in table}
             told = {name: value for name, value in table.items() if name not in written}
-            if path.suffix.lower() != ".csv":
-                _refuse(written, file, "is only for CSV tables")
+            if not formats.format_of(path).dialect:
+                _refuse(written, file, f"is only for tables of text: {', '.join(formats.OF_TEXT)}")
             with located(file):
 
                 def opened(one: pathlib.Path, written: Mapping[str, Any] = written) -> Contents:
-                    _check_suffix(one)
-                    own = written if one.suffix.lower() == ".csv" else {}
-                    return files.enter_context(READERS[one.suffix.lower()](one, folder, **own))
+                    its = formats.format_of(one)
+                    own = written if its.dialect else {}
+                    return files.enter_context(its.opened(one, folder, **own))
 
                 contents = opened(path)
                 with located(place + file):
-                    contents = with_others(contents, told, opened)
+                    contents = with_others(contents, told, opened, root)
                     planned = plans(told, contents.names, path.stem if len(said) > 1 else "")
                 contents.prepare({name for plan in planned for name in plan.channels})
                 for plan in planned:
@@ -249,16 +245,6 @@ def converted(
     return used
 
 
-def _check_suffix(path: pathlib.Path) -> None:
-    """Raise an error if no reader reads files with this suffix."""
-    if path.suffix.lower() not in READERS:
-        raise RecordingError(
-            f"etid cannot import files with the suffix {path.suffix!r}",
-            file=str(path),
-            remedy=f"Export it as one of {', '.join(READERS)}, or write an etid file with h5py",
-        )
-
-
 def _refuse(given: Mapping[str, Any], file: str, reason: str) -> None:
     for name in given:
         raise RecordingError(reason, file=file, field=name, remedy="Remove the argument")
@@ -267,28 +253,43 @@ def _refuse(given: Mapping[str, Any], file: str, reason: str) -> None:
 # --- Channels of other files ----------------------------------------------------------------------
 
 
+def other_file(name: str) -> tuple[str, str]:
+    """File and channel of a name such as `open.csv:CH1`; the file is empty in another name."""
+    places = [place for place, character in enumerate(name) if character == ":"]
+    for place in places:
+        if pathlib.Path(name[:place]).suffix.lower() in formats.SUFFIXES:
+            return name[:place], name[place + 1 :]
+    return "", name
+
+
 def with_others(
-    contents: Contents, mapping: Mapping[str, Any], opened: Callable[[pathlib.Path], Contents]
+    contents: Contents,
+    mapping: Mapping[str, Any],
+    opened: Callable[[pathlib.Path], Contents],
+    root: pathlib.Path | None,
 ) -> Contents:
     """The contents of a file, together with the channels of other files that a mapping names.
 
     A mapping names such a channel `FILE:NAME`: channel `NAME` of the file with this path, from the
-    current folder. So V_th may be recorded once for all trials.
+    folder that is imported or from the current one. So V_th may be recorded once for all trials.
     """
     others: dict[str, Contents] = {}
-    signals = [said.get(name) for said in (mapping, *recordings_of(mapping)) for name in CHANNELS]
-    for name in [str(of.get("channel")) for of in signals if isinstance(of, Mapping)]:
-        file = name.rpartition(":")[0]
-        if name not in contents.names and file not in others and pathlib.Path(file).is_file():
-            with located(file):
-                others[file] = opened(pathlib.Path(file))
+    for said in (mapping, *recordings_of(mapping)):
+        for signal in CHANNELS:
+            name = str(of.get("channel")) if isinstance(of := said.get(signal), Mapping) else ""
+            file, _ = other_file(name)
+            if file and name not in contents.names and file not in others:
+                with located(field=signal):
+                    path = _found(file, root)
+                with located(str(path)):
+                    others[file] = opened(path)
     if not others:
         return contents
 
     def channel(name: str) -> Channel:
         if name in contents.names:
             return contents.channel(name)
-        file, _, own = name.rpartition(":")
+        file, own = other_file(name)
         with located(file):
             return dataclasses.replace(others[file].channel(own), name=name)
 
@@ -301,6 +302,26 @@ def with_others(
 
     foreign = (f"{file}:{name}" for file, other in others.items() for name in other.names)
     return Contents((*contents.names, *foreign), channel, prepare)
+
+
+def _found(file: str, root: pathlib.Path | None) -> pathlib.Path:
+    """Path of a further file, in the folder that is imported or in the current one."""
+    folders = [pathlib.Path()] if root is None else [root, pathlib.Path()]
+    paths = [folder / file for folder in folders if (folder / file).is_file()]
+    named = f"the folder {str(root)!r} and in the current folder"
+    if not paths:
+        raise RecordingError(
+            f"there is no file {file!r} in {'the current folder' if root is None else named}",
+            remedy="Labels in the name of a further file are for a folder, with --labels"
+            if "{" in file
+            else "Write its path as seen from there",
+        )
+    if not paths[0].samefile(paths[-1]):
+        raise RecordingError(
+            f"there is a file {file!r} in {named}",
+            remedy="Write the path of the one that is meant in full",
+        )
+    return paths[0]
 
 
 # --- Measured impedances --------------------------------------------------------------------------

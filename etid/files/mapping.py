@@ -285,9 +285,9 @@ def _check_complete(said: Mapping[str, Any], names: Sequence[str]) -> None:
         missing.append("scale")
     if not missing:
         return
-    free = [name for name in names if name not in [of.get("channel") for of in own]]
-    example = {"pulse_rate": "60", "scale": "1"} | dict(zip(voltages, free, strict=False))
-    options = [f"--{name.replace('_', '-')} {example.get(name, 'CHANNEL')}" for name in missing]
+    # No channel is proposed: the first one is often the time.
+    example = {"pulse_rate": "60", "scale": "1"}
+    options = [f"--{name.replace('_', '-')} {example.get(name, 'NAME')}" for name in missing]
     hints = {
         "v_th": "or name the measured current, with --current",
         "scale": "a scale of 1 is that of values at the terminal",

@@ -15,6 +15,7 @@ import numpy as np
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, near_miss
+from etid.recordings.resistance import resistance
 
 Type = Literal["text", "paths", "label", "number", "range", "samples"]
 
@@ -126,13 +127,15 @@ class Field:
             raise RecordingError(f"has shape {array.shape}")
         if many and self.type == "label":
             return tuple(map(self.checked, items))
+        if self.type == "number":  # in a file it is none as text
+            items[0] = real(self.name, items[0])
         found = self.checked(items if many else items[0])
         if self.values and found not in self.values:
             raise RecordingError(f"is {found!r}")
         return found
 
     def checked(self, value: Any) -> Any:
-        """Value that a caller gives, as Python types."""
+        """Value that a caller gives, as Python types; a resistance may be a text such as 98k8."""
         if value is None:
             return self.empty
         if self.type == "text" and not isinstance(value, str):
@@ -146,6 +149,8 @@ class Field:
             if len(ends) != 2 or not ends[0] < ends[1]:
                 raise RecordingError(f"is {ends}, must be two increasing numbers", field=self.name)
             return ends
+        if self.unit == "ohm" and isinstance(value, str):
+            value = resistance(value, self.name)
         number = real(self.name, value)
         if self.positive and number <= 0:
             raise RecordingError(f"is {number:g} {self.unit}, must be > 0", field=self.name)
@@ -312,7 +317,7 @@ class Given(TypedDict, total=False):
     path: str
     sample_rate: Required[Number]
     pulse_rate: Required[Number]
-    r_load: Number | None
+    r_load: Number | str | None
     subject: Label | None
     session: Label | None
     site: Label | None

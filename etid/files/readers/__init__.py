@@ -3,5 +3,5 @@
 A reader is a context manager `opened(path, folder)` that returns the `Contents` of the file. It may
 create temporary files in `folder`. `npz` is an exception: it returns recordings.
 
-A new format also needs its suffix in `READERS` of `etid.files.importing`.
+`etid.files.formats` declares the formats and names the reader of each.
 """

@@ -7,8 +7,11 @@ A column `open [mV]` or `open (mV)` has the name `open` and the unit mV. Oscillo
 units into a second line instead, such as `(ms),(mV),(mV)` or `Sequence,VOLT,VOLT,-6e-3,5e-6`.
 
 A table without names has the columns `1`, `2`, …; `header_line` is then 0. Some oscilloscopes
-write such tables, with a preamble in the first columns of the first rows. If a preamble names the
-number of samples or their interval, the table is compared with it.
+write such tables, with a preamble in the first columns of the first rows; other programs write
+lines of text above the numbers. If a preamble names the number of samples or their interval, the
+table is compared with it.
+
+Columns with one name tell their place: `CH1#2` and `CH1#4` are the second and the fourth column.
 """
 
 import codecs
@@ -24,7 +27,15 @@ from typing import Any, BinaryIO, TextIO
 import numpy as np
 
 from etid.circuits.display import several
-from etid.files.channel import Contents, one_unit, parse_unit, rate_of, spooled, with_unit
+from etid.files.channel import (
+    Contents,
+    by_place,
+    one_unit,
+    parse_unit,
+    rate_of,
+    spooled,
+    with_unit,
+)
 from etid.recordings.recording import RecordingError
 
 ROWS = 1 << 16  # rows of text in memory at a time
@@ -35,7 +46,7 @@ class Dialect:
     """How a table is written.
 
     Attributes:
-        delimiter: Character between the cells.
+        delimiter: Character between the cells. A blank means one or more blanks or tabs.
         decimal: Decimal sign of the numbers: `.` or `,`.
         header_line: Line with the names of the columns, counted from 1; lines above are skipped.
             0: no line names them.
@@ -48,12 +59,26 @@ class Dialect:
     encoding: str = "utf-8-sig"
 
     def __post_init__(self) -> None:
-        if len(self.delimiter) != 1 or self.decimal not in (".", ",") or self.header_line < 0:
-            raise RecordingError(f"the table cannot be written as {self}")
+        def must(right: bool, field: str, be: str) -> None:
+            if not right:
+                raise RecordingError(f"is {getattr(self, field)!r}, must be {be}", field=field)
+
+        must(len(self.delimiter) == 1, "delimiter", "one character, such as ';'")
+        must(self.decimal in (".", ","), "decimal", "'.' or ','")
+        must(self.decimal != self.delimiter, "decimal", "another character than the delimiter")
+        must(self.header_line >= 0, "header_line", "the number of a line, or 0")
+        try:
+            codecs.lookup(self.encoding)
+        except LookupError:
+            must(False, "encoding", "an encoding of Python, such as cp1252")
+
+    def tidy(self, line: str) -> str:
+        """A line with the delimiter once between two cells."""
+        return " ".join(line.split()) if self.delimiter == " " else line
 
     def cells(self, line: str) -> list[str]:
         """Cells of a line."""
-        row = next(csv.reader([line], delimiter=self.delimiter), [])
+        row = next(csv.reader([self.tidy(line)], delimiter=self.delimiter), [])
         return [cell.strip() for cell in row]
 
     def units(self, cells: Sequence[str], count: int) -> tuple[str, ...] | None:
@@ -145,9 +170,10 @@ def _rows(
     all cells up to the last number of the first row, and none without a name.
     """
     usual = least = None  # delimiters of a row that is right, and cells that every row needs
-    for number, line in enumerate(itertools.islice(text, skipped, None), skipped + 1):
-        if not line.strip():
+    for number, own in enumerate(itertools.islice(text, skipped, None), skipped + 1):
+        if not own.strip():
             continue
+        line = dialect.tidy(own)
         points = dialect.decimal != "." and "." in line
         if points or line.count(dialect.delimiter) != usual:
             cells = dialect.cells(line)
@@ -171,7 +197,7 @@ def _rows(
                     )
             if len(cells) <= width and '"' not in line:
                 usual = line.count(dialect.delimiter)
-        recent.append(line)
+        recent.append(own)
         yield line if dialect.decimal == "." else line.replace(dialect.decimal, ".")
 
 
@@ -256,7 +282,7 @@ def _refuse_another(path: pathlib.Path) -> None:
 def _guessed(lines: list[str], encoding: str) -> Dialect | None:
     """The dialect in which a table has rows of numbers; None if no dialect has them."""
     filled = [number for number, line in enumerate(lines, 1) if line.strip()]
-    signs = (",.", ";.", ";,", "\t.", "\t,")  # delimiters and decimal signs
+    signs = (",.", ";.", ";,", "\t.", "\t,", " .", " ,")  # delimiters and decimal signs
     for delimiter, decimal in signs:
         dialect = Dialect(delimiter, decimal, encoding=encoding)
         cells = [dialect.cells(lines[number - 1]) for number in filled]
@@ -269,6 +295,8 @@ def _guessed(lines: list[str], encoding: str) -> Dialect | None:
             units = dialect.units(cells[row - 1], len(cells[row - 1])) is not None
             header = max(0, row - 1 - units)
             named = not dialect.are_numbers(cells[header])
+            if delimiter == " ":  # a name that contains a blank would shift the others
+                named &= len(cells[header]) == width
             return dataclasses.replace(dialect, header_line=filled[header] if named else 0)
     for delimiter, decimal in signs:  # columns of numbers beside a preamble
         dialect = Dialect(delimiter, decimal, 0, encoding)
@@ -287,23 +315,41 @@ def _names(dialect: Dialect, line: str) -> list[str]:
 
 def _header(text: TextIO, dialect: Dialect) -> tuple[tuple[str, ...], tuple[str, ...], int]:
     """Names, units, and the number of lines above the numbers."""
+    if not dialect.header_line:
+        lines = list(itertools.islice(text, LINES))
+        first = _first_row(lines, dialect)
+        cells = _names(dialect, lines[first] if lines else "")
+        return tuple(cells), ("",) * len(cells), first
     skipped = dialect.header_line - 1
     for _ in range(skipped):
         text.readline()
-    line = text.readline()
-    cells = _names(dialect, line)
-    if not dialect.header_line:
-        return tuple(cells), ("",) * len(cells), 0
+    cells = _names(dialect, text.readline())
     if dialect.are_numbers(cells):
         raise RecordingError(
             f"line {dialect.header_line} holds numbers, not the names of the columns",
             remedy="If no line names them, add --header-line 0; the columns are then 1, 2, …",
         )
     names, units = zip(*map(with_unit, cells), strict=True) if cells else ((), ())
+    names = tuple(by_place(names))
     below = dialect.units(dialect.cells(text.readline()), len(names))
     if below is None:
         return names, units, skipped + 1
     return names, tuple(map(one_unit, names, units, below)), skipped + 2
+
+
+def _first_row(lines: Sequence[str], dialect: Dialect) -> int:
+    """Number of lines above the first row of a table without names.
+
+    Lines above have a text, and other columns of numbers than the two lines below them. A line
+    of numbers is a row.
+    """
+    rows = [dialect.cells(line) for line in lines]
+    for place, row in enumerate(rows):
+        below = rows[place : place + 3]
+        numbers = [None not in map(dialect.number, cells) for cells in zip(*below, strict=False)]
+        if dialect.are_numbers(row) or (any(numbers) and len({*map(len, below)}) == 1):
+            return place
+    return 0
 
 
 def _preamble(path: pathlib.Path, dialect: Dialect) -> tuple[float, float | None]:

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from etid.files.channel import Contents, one_unit, spooled, with_unit
+from etid.files.channel import Contents, by_place, one_unit, spooled, with_unit
 from etid.files.readers.delimited import ROWS, Dialect
 from etid.recordings.errors import RecordingError, optional
 
@@ -21,7 +21,7 @@ from etid.recordings.errors import RecordingError, optional
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Columns of a workbook."""
     openpyxl = optional("openpyxl", "excel", str(path))
-    names: list[str] = []  # several columns may have one name
+    names: list[str] = []
     places: dict[str, tuple[Any, int, int]] = {}  # sheet, first row of numbers, column
     units: dict[str, str] = {}
 
@@ -44,11 +44,12 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
             head, second, *_ = *sheet.iter_rows(max_row=2, values_only=True), (), ()
             cells = ["" if cell is None else str(cell) for cell in second]
             below = Dialect().units(cells, len(head))
-            for column, (cell, said) in enumerate(
-                zip(head, below or [""] * len(head), strict=True), 1
+            titles = ["" if cell is None else str(cell).strip() for cell in head]
+            own, units_of = zip(*map(with_unit, titles), strict=True) if titles else ((), ())
+            for column, (name, unit, said) in enumerate(
+                zip(by_place(own), units_of, below or [""] * len(head), strict=True), 1
             ):
-                if cell is not None:
-                    name, unit = with_unit(str(cell).strip())
+                if name:
                     names.append(f"{sheet.title}/{name}" * bool(number) or name)
                     places[names[-1]] = sheet, 2 + (below is not None), column
                     units[names[-1]] = one_unit(name, unit, said)

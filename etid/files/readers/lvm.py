@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from etid.files.channel import Contents, rate_of, spooled
+from etid.files.channel import Contents, by_place, rate_of, spooled
 from etid.files.clock import QUARTZ
 from etid.files.readers.delimited import LINES, Dialect, spool
 from etid.recordings.recording import RecordingError
@@ -44,7 +44,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     own = {
         key: rest for key, *rest in (line.split(separator) for line in lines[ends[0] + 1 : ends[1]])
     }
-    names = [cell.strip() for cell in lines[ends[1] + 1].split(separator)]
+    names = by_place([cell.strip() for cell in lines[ends[1] + 1].split(separator)])
     if names[-1] == "Comment":
         names.pop()
     if _first(said, "X_Columns", "One") not in ("No", "One"):
