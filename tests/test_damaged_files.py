@@ -9,7 +9,7 @@ import pytest
 
 import etid
 from benchmarks import fuzz, specimens
-from etid.files.readers import matlab
+from etid.files.readers import matlab_5
 from etid.recordings import hdf5, limits, untrusted
 from etid.results.study_fits import StudyFits
 
@@ -272,10 +272,10 @@ def test_a_damaged_matlab_5_is_refused_before_scipy_ends_the_process(
     path = tmp_path / "rig.mat"
     data = bytearray(kinds["matlab5"].good[0])
     assert (data[144:146], data[176]) == (b"\x06\x00", 9)  # a real double, and its numbers
-    matlab.check(_written(path, data))
+    matlab_5.check(_written(path, data))
     data[place] = value
     with pytest.raises(etid.RecordingError, match=message):
-        matlab.check(_written(path, data))
+        matlab_5.check(_written(path, data))
 
 
 def _written(path, data):

@@ -137,7 +137,8 @@ def sources_of(
             f"{plan.signals['v_out'].channel!r} would be {len(trials)} trials of {length} samples, "
             f"{rounded(periods)} pulse periods each",
             field="v_out",
-            remedy="Rows are trials, columns are times: transpose the variables",
+            remedy="Rows are trials, columns are times: transpose the variables, or name one column, "
+            "as m(:,2) in a MATLAB file",
         )
     parts, electrodes = _parts(plan, channels, channel, common)
     several = stacked or bool(parts)
@@ -240,9 +241,9 @@ def _parts(
     for own in (*channels.values(), separating):
         if len(own.shape) != 1:
             raise RecordingError(
-                f"channel {own.name!r} has shape {own.shape}; only a channel of shape (time,) can "
-                "be split",
+                f"channel {own.name!r} has {own.size}; only one long record can be split",
                 field="split",
+                remedy="Remove split, or name a channel with one record",
             )
 
     def samples(own: Channel) -> np.ndarray:
@@ -341,15 +342,16 @@ def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dic
         for name, rows in rows_of.items()
     )
     if not fits:
-        shapes = ", ".join(
-            f"{signals[name].channel} {channels[name].shape}"
-            + f" rows {rows}" * (signals[name].rows is not None)
+        sizes = ", ".join(
+            f"{name} has {channels[name].size}"
+            + f", of which {len(rows)} are used" * (signals[name].rows is not None)
+            + f" ({signals[name].channel!r})"
             for name, rows in rows_of.items()
         )
         raise RecordingError(
-            f"shapes do not fit each other: {shapes}",
-            remedy="All shapes must be (time,) or (trial, time); only v_th may be (time,), or one "
-            "row, if v_out is a stack",
+            f"the channels do not fit each other: {sizes}",
+            remedy="All have equally many samples, from the same instant on, and equally many "
+            "trials; only v_th may have one for all trials",
         )
     return rows_of
 

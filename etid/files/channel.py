@@ -62,11 +62,11 @@ class Channel:
                 "most 64 bits"
             )
         if 0 in self.shape:
-            raise RecordingError(f"{self.name!r} is empty, of shape {self.shape}")
+            raise RecordingError(f"{self.name!r} is empty")
         if self.length > limits.SAMPLES or max(self.shape[:-1], default=0) > limits.TRIALS:
             raise RecordingError(
-                f"channel {self.name!r} has shape {self.shape}; etid reads at most {limits.TRIALS} "
-                f"trials of {limits.SAMPLES} samples",
+                f"channel {self.name!r} has {self.size}; etid reads at most {limits.TRIALS} trials "
+                f"of {limits.SAMPLES} samples",
                 remedy="Split the channel",
             )
         unit = one_unit(self.name, self.unit, with_unit(self.name)[1])
@@ -82,6 +82,15 @@ class Channel:
     def length(self) -> int:
         """Number of samples of a trial."""
         return self.shape[-1]
+
+    @property
+    def size(self) -> str:
+        """Text for errors: how many samples and trials."""
+        if len(self.shape) == 1:
+            return f"{self.length} samples"
+        if len(self.shape) == 2:
+            return f"{self.shape[0]} trials of {self.length} samples"
+        return f"an array of {' x '.join(map(str, self.shape))} numbers"
 
     def blocks(self, trial: int = 0) -> Iterator[np.ndarray]:
         """The stored samples of a trial, in blocks of `BLOCK` samples."""

@@ -70,7 +70,9 @@ def _clock(time: Channel, factor: float, length: int) -> float:
     """Sample rate [Hz] from the first and the last time stamp; the stamps must be uniform."""
     if time.shape != (length,) or length < 2:
         raise RecordingError(
-            f"has shape {time.shape}, must be ({length},) with at least two times", field="time"
+            f"has {time.size}, but v_out has {length} samples; each sample has one time, and there "
+            "are at least two",
+            field="time",
         )
 
     def stamps() -> Iterator[np.ndarray]:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from etid.files.channel import Contents
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
 from etid.recordings.errors import RecordingError
+from etid.recordings.replacing import HDF5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +105,13 @@ def format_of(path: pathlib.Path) -> Format:
     for one in FORMATS:
         if suffix in one.suffixes:
             return one
+    if suffix in HDF5:
+        raise RecordingError(
+            "is an HDF5 file; one that etid has written needs no import",
+            file=str(path),
+            remedy=f"Use it as it is, as in etid check {path}; write that of another program anew, "
+            "as data_schema/README.md shows",
+        )
     raise RecordingError(
         f"etid cannot import files with the suffix {path.suffix!r}",
         file=str(path),

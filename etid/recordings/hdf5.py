@@ -77,8 +77,18 @@ def check(path: str | os.PathLike[str]) -> list[RecordingError]:
 
 def _check_root(file: h5py.File, name: str) -> None:
     found: dict[str, str] = {}
+    with translated(name, field="schema"):
+        if "schema" in file.attrs and attribute(file, "schema") == schema.FITS:
+            raise RecordingError(
+                "is a file of fits, not of recordings",
+                remedy="Name the file of recordings, or of a driver (etid calibrate); etid report "
+                "and etid export take a file of fits",
+            )
+    remedy = (
+        f"The file needs the attributes schema={schema.NAME!r} and schema_version; convert a file "
+        "of another program with `etid import`"
+    )
     for field in schema.at("file attribute").values():
-        remedy = f"The file needs the attributes schema={schema.NAME!r} and schema_version"
         with translated(name, field=field.name):
             if field.name not in file.attrs:
                 near = near_miss(field.name, attribute_names(file))

@@ -12,6 +12,7 @@ from etid.recordings.fields import DECLARED, KINDS, SIGNALS, Field, Place
 
 NAME = "etid/recording"
 VERSION = "1.0"
+FITS = "etid/fits"  # of a file of fits, which is no file of recordings
 
 FIELDS: tuple[Field, ...] = (
     Field(

@@ -16,6 +16,7 @@ there the library repeats what it has done behind the guard, and reads numbers.
 
 import contextlib
 import functools
+import importlib
 import io
 import math
 import os
@@ -26,6 +27,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from h5py import h5z  # type: ignore[attr-defined]  # compiled, without stubs
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, located, require_file
@@ -34,6 +36,7 @@ DAMAGED = "The file is damaged or was not closed: copy or record it again"
 
 _HEAP = b"GCOL\x01\0\0\0"
 _OBJECT = struct.Struct("<HH4xQ")  # index, reference count, size
+_WRITTEN = 0b101  # marks in a superblock: open to write, and open to write while others read
 _TEXT = struct.Struct("<IQI")  # length, address of the heap, index of the object
 # Start of the type of a text of variable length: version and class, kind, and the size of `_TEXT`.
 _VARIABLE = re.compile(
@@ -133,22 +136,46 @@ def guarded(path: str, **options: Any) -> Iterator[h5py.File]:
         )
     with translated(path), _unlocked(path), contextlib.ExitStack() as stack:
         raw = stack.enter_context(Guarded(path, "rb"))
-        _check_numbers(raw)
-        file = stack.enter_context(h5py.File(raw, "r", **options))
+        _check_superblock(raw)
+        try:
+            opened = h5py.File(raw, "r", **options)
+        except Exception as error:
+            # The frames of the library hold objects that lead to `raw`. If they live until the
+            # process ends, the library ends it with a segmentation fault.
+            raise error.with_traceback(None) from None
+        file = stack.enter_context(opened)
         yield file
 
 
-def _check_numbers(raw: io.FileIO) -> None:
-    """Raise an error if addresses or lengths do not have 8 bytes: the guard needs 8 bytes."""
+def _check_superblock(raw: io.FileIO) -> None:
+    """Raise an error if a file was not closed or not copied whole, or has other addresses.
+
+    Addresses and lengths must have 8 bytes, as the guard needs it.
+    """
     for place in (0, 512, 1024, 2048):
         raw.seek(place)
-        head = raw.read(16)
+        head = raw.read(48)
         if head.startswith(b"\x89HDF\r\n\x1a\n"):
-            version = head[8]  # of the superblock
-            at = 13 if version < 2 else 9
-            if version > 3 or head[at : at + 2] != b"\x08\x08":
-                raise OSError("its addresses do not have 8 bytes")
             break
+    else:
+        return
+    version = head[8]
+    at, end = (13, 40 if version == 0 else 44) if version < 2 else (9, 28)
+    if version > 3 or head[at : at + 2] != b"\x08\x08":
+        raise OSError("its addresses do not have 8 bytes")
+    if version == 3 and head[11] & _WRITTEN:
+        raise RecordingError(
+            "was not closed by the program that wrote it, or is still open there",
+            remedy="Close it there; if that program has ended, clear its mark in a copy of the "
+            "file: h5clear -s COPY (a tool of HDF5)",
+        )
+    size, stored = os.fstat(raw.fileno()).st_size, int.from_bytes(head[end : end + 8], "little")
+    if stored > size:
+        raise RecordingError(
+            f"ends at byte {size}, its data at byte {stored}: it was not copied whole, or not "
+            "closed by the program that wrote it",
+            remedy="Copy it again, or record it again",
+        )
     raw.seek(0)
 
 
@@ -200,6 +227,7 @@ def check_size(dataset: h5py.Dataset) -> None:
         raise RecordingError(
             "its samples are in another file", remedy="Copy the samples into the file"
         )
+    _check_filters(dataset)
     itemsize = dataset.dtype.itemsize
     declared = math.prod(dataset.shape or ()) * itemsize
     chunk = math.prod(dataset.chunks or ()) * itemsize
@@ -218,6 +246,25 @@ def check_size(dataset: h5py.Dataset) -> None:
             f"declares {declared} bytes, but only {held} bytes are stored",
             remedy=DAMAGED,
         )
+
+
+def _check_filters(dataset: h5py.Dataset) -> None:
+    """Raise an error if the library lacks a filter; hdf5plugin, where installed, brings more."""
+    properties = dataset.id.get_create_plist()
+    for number in range(properties.get_nfilters()):
+        code, _, _, name = properties.get_filter(number)
+        if h5z.filter_avail(code):
+            continue
+        with contextlib.suppress(ImportError):
+            importlib.import_module("hdf5plugin")  # it registers its filters
+        if not h5z.filter_avail(code):
+            called = name.decode("utf-8", "replace").rstrip("\0").partition(";")[0]
+            raise RecordingError(
+                f"is compressed by filter {code}{f' ({called})' if called else ''}, which the HDF5 "
+                "library does not have",
+                remedy="Run pip install hdf5plugin, which has the usual filters, or write the file "
+                "with gzip",
+            )
 
 
 def check_texts(dataset: h5py.Dataset, path: str) -> None:

@@ -12,11 +12,12 @@ from etid.circuits.lookup import circuit_class
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of
+from etid.recordings.schema import FITS
 from etid.results.fit import Limited
 from etid.results.hdf5_table import Table, check_same_length
 from etid.results.verdicts import verdicts_of
 
-SCHEMA = "etid/fits"
+SCHEMA = FITS
 VERSION = "1.4"
 # Columns that describe each recording: its path, its labels, and numbers.
 DESCRIBED = {"path": "text"} | {

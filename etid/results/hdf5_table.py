@@ -12,7 +12,7 @@ from etid.circuits.display import several
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import check_ending, replacing_hdf5
-from etid.recordings.schema import version_problem
+from etid.recordings.schema import NAME, version_problem
 from etid.recordings.untrusted import (
     attribute,
     check_size,
@@ -175,7 +175,7 @@ def opened_table(path: str | os.PathLike[str], kind: str, version: str) -> Itera
         table = Table(file, name)
         schema = table.attribute("schema") if "schema" in table.attributes else None
         if schema != kind:
-            recordings = schema == "etid/recording"
+            recordings = schema == NAME
             raise RecordingError(
                 f"is {schema!r}, not {kind!r}",
                 file=name,
