@@ -10,6 +10,7 @@ import jax
 from benchmarks.machine import pin
 from benchmarks.ngspice import NgspiceError
 from benchmarks.rivals import RivalError
+from etid.recordings.errors import install
 
 NAMES = (
     *("spice", "coverage", "driver_order", "delays", "noise", "tolerances", "selection", "design"),
@@ -24,8 +25,16 @@ def asked(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """The arguments of a command line; `module` is the benchmark that it names."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     commands = parser.add_subparsers(required=True)
+    words = sys.argv[1:] if argv is None else argv
     for name in NAMES:
-        module = importlib.import_module(f"benchmarks.{PLACES.get(name, name)}")
+        try:
+            module = importlib.import_module(f"benchmarks.{PLACES.get(name, name)}")
+        except ModuleNotFoundError as error:
+            needed = f"needs the package {error.name}: {install('bench')}"
+            if name in words:
+                sys.exit(f"{parser.prog} {name} {needed}")
+            commands.add_parser(name, help=needed.replace("%", "%%"))
+            continue
         summary = (module.__doc__ or "").splitlines()[0]
         command = commands.add_parser(name, help=summary, description=module.__doc__)
         for add in module.OPTIONS:

@@ -19,9 +19,11 @@ from typing import Any
 import jax
 import numpy as np
 
+import etid
+
 ROOT = pathlib.Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"  # of the last full run, which the README shows
-PACKAGES = ("etid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy", "h5py")
+PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy", "h5py")
 IMPORTS = 3
 MAPPINGS = 30_000  # half of what Linux allows; one test file needs a few thousand
 
@@ -31,6 +33,7 @@ def provenance() -> dict[str, str]:
         "commit": _commit(),
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
         "python": platform.python_version(),
+        "etid": etid.__version__,
         **{name: importlib.metadata.version(name) for name in PACKAGES},
     }
 

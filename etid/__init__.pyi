@@ -31,7 +31,7 @@ from .files.exporting import export_fits as export_fits
 from .files.exporting import export_study as export_study
 from .files.folder import import_folder as import_folder
 from .files.importing import import_file as import_file
-from .files.importing import read_impedance as read_impedance
+from .files.spectra import read_impedance as read_impedance
 from .identify.amplitudes import identify_amplitudes as identify_amplitudes
 from .identify.driver import identify_driver as identify_driver
 from .identify.file import fit_file as fit_file

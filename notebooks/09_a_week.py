@@ -96,7 +96,7 @@ print(len(list(folder.iterdir())), "files, such as", min(folder.iterdir()).name)
 
 # %% [markdown]
 # ## The calibration, while the resistor is still connected
-# `etid import d1_98k8.csv -o d1.h5 --r-load 98800 …` and `etid calibrate d1.h5 -o driver.h5` say at
+# `etid import d1_98k8.csv -o d1.h5 --r-load 98k8 …` and `etid calibrate d1.h5 -o driver.h5` say at
 # once what the driver is worth: the standard errors to expect of skin, and what would make them
 # smaller. On the next day, `--former driver.h5` says whether the driver has moved.
 

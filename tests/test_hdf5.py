@@ -227,7 +227,7 @@ PROBLEMS = [
     (put("v_out", np.array([b"a", b"b"])), "v_out: has dtype |S1"),
     (put("v_out", np.zeros(4, complex)), "v_out: has dtype complex128"),
     (put("v_out", np.zeros(5)), "shapes do not fit each other: v_th (4,), v_out (5,)"),
-    (put("v_out", 1.0), "v_out: has shape ()"),
+    (put("v_out", 1.0), "v_out: is one number"),
     (put("v_out", np.zeros((1, 1, 4))), "v_out: has shape (1, 1, 4)"),
     (put("v_out", np.zeros((0, 4))), "v_out: is empty"),
     (put("v_out", h5py.Empty("f8")), "v_out: is empty"),

@@ -88,7 +88,7 @@ def archive(path, **changes):
         (archive, {"adc_ref": None}, r"adc_ref: there is no 'adc_ref'; the names are 'adc_th', "),
         (archive, {"adc_out": np.zeros((3, 6), "i2")}, r"adc_th \(2, 6\), adc_out \(3, 6\)"),
         (archive, {"adc_out": np.zeros(6, "i2")}, "shapes do not fit"),
-        (archive, {"adc_ref": np.zeros((1, 5), "i2")}, "shapes do not fit each other: adc_th"),
+        (archive, {"adc_ref": np.zeros((1, 5), "i2")}, "1 row of 'adc_th' with 6 s.*with 5 samp"),
         (archive, {"R_ref": [1.0, 2.0]}, "shapes do not fit"),
         (archive, {"fs": 0.0}, "sample_rate: is 0 hertz"),
         (archive, {"scale": 0.0}, "scale: is 0"),
@@ -99,12 +99,12 @@ def archive(path, **changes):
         (
             variables,
             {"th": TH, "out": TH[:3]},
-            "v_th has 5 samples .'th'., v_out has 3 samples .'out'",
+            "v_th: 5 samples .'th'., v_out: 3 samples .'out'",
         ),
         (
             variables,
             {"th": np.ones((2, 5)), "out": TH},
-            "v_th has 2 trials of 5 samples .*v_out has 5",
+            "v_th: 2 trials of 5 samples .*v_out: 5 s",
         ),
         (
             variables,

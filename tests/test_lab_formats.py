@@ -237,6 +237,20 @@ def test_electrodes_may_fire_without_a_pause(tmp_path):
     assert [round(one.periods, 1) for one in recordings] == [3, 3]
 
 
+def test_a_train_that_an_end_of_the_record_cuts_is_left_out_with_a_note(tmp_path):
+    arrays = in_turn()
+    end = arrays["th"].size - 2000 - round(PERIOD)  # inside the last train
+    arrays = {name: array[:end] for name, array in arrays.items()}
+    given = {"split": "which", "electrode": "E{which}"}
+    recordings, [used] = of_arrays(tmp_path, arrays, **given)
+    assert [one.electrode for one in recordings] == ["E7", "E7", "E12"]
+    note = "an end of the record cuts 1 train of pulses, which is left out"
+    assert (used.notices, str(used).splitlines()[-1]) == ((note,), f"  note: {note}")
+    first = {name: array[2100 : 2000 + round(3 * PERIOD)] for name, array in arrays.items()}
+    with pytest.raises(RecordingError, match="an end of the record cuts the first or the last"):
+        of_arrays(tmp_path, first, **given)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

@@ -224,8 +224,9 @@ def _blank(string: str) -> AbstractCircuit:
 
 
 def _refuse(string: str, at: int) -> NoReturn:
+    cause = f"cannot read {string[at:]!r}" if string[at:] else "it ends too early"
     raise ValueError(
-        f"{string!r} is no circuit: cannot read {string[at:] or 'its end'!r}; write R, C, L or "
+        f"{string!r} is no circuit: {cause}; write R, C, L or "
         "CPE with a number, '-' for series and 'p(…,…)' for parallel, as in 'R0-p(R1,C1)'"
     )
 

@@ -137,10 +137,10 @@ def sources_of(
             f"{plan.signals['v_out'].channel!r} would be {len(trials)} trials of {length} samples, "
             f"{rounded(periods)} pulse periods each",
             field="v_out",
-            remedy="Rows are trials, columns are times: transpose the variables, or name one column, "
-            "as m(:,2) in a MATLAB file",
+            remedy="Rows are trials, columns are times: transpose the variables, or name one "
+            "column, as in m(:,2) of a MATLAB file",
         )
-    parts, electrodes = _parts(plan, channels, channel, common)
+    parts, electrodes, cut = _parts(plan, channels, channel, common)
     several = stacked or bool(parts)
     if parts:  # the trials are the rounds of each electrode
         trials = [electrodes[:i].count(one) for i, one in enumerate(electrodes)]
@@ -167,9 +167,12 @@ def sources_of(
         unloaded = (file, path) if th is None else (file, th[0].name, th[1])
         sources[path] = _Source(tuple(layout), unloaded, file, metadata, records)
     samples = parts[0].stop - parts[0].start if parts else length
-    notices = tuple(dict.fromkeys(own.notice for own in channels.values() if own.notice))
+    notices = dict.fromkeys(own.notice for own in channels.values() if own.notice)
+    if cut:
+        trains = "1 train of pulses, which is" if cut == 1 else f"{cut} trains of pulses, which are"
+        notices[f"an end of the record cuts {trains} left out"] = None
     return sources, Imported(
-        file, tuple(sources), samples, rate, rate_by, common.pulse_rate, used, notices
+        file, tuple(sources), samples, rate, rate_by, common.pulse_rate, used, (*notices,)
     )
 
 
@@ -223,13 +226,13 @@ def _parts(
     channels: Mapping[str, Channel],
     channel: Callable[[str], Channel],
     common: Metadata,
-) -> tuple[list[slice], list[str]]:
-    """The parts of one long record, and the electrode of each, which is empty if all are of one.
+) -> tuple[list[slice], list[str], int]:
+    """The parts of one long record, the electrode of each, and how many an end of it cuts.
 
-    Both lists are empty if the record is not to be split.
+    An electrode is empty if all are of one. Both lists are empty if nothing is to be split.
     """
     if not plan.split:
-        return [], []
+        return [], [], 0
     by_pulses = plan.split == PAUSES
     if by_pulses and "v_th" not in channels:
         raise RecordingError(
@@ -253,12 +256,13 @@ def _parts(
     more = None if by_pulses else samples(separating)
     order, rates = plan.electrodes, (common.sample_rate, common.pulse_rate)
     if plan.numbered and more is not None:
-        parts = split(samples(cause), *rates, which=more)
+        parts, cut = split(samples(cause), *rates, which=more)
         period = rates[0] / rates[1]
         starts = np.array([part.start + round(period / 5) for part in parts])
         numbers = firing(more, starts, period)
-        return parts, [order[0].replace(f"{{{plan.split}}}", str(number)) for number in numbers]
-    parts = split(samples(cause), *rates, more, cut=not order)
+        named = [order[0].replace(f"{{{plan.split}}}", str(number)) for number in numbers]
+        return parts, named, cut
+    parts, cut = split(samples(cause), *rates, more, cut=not order)
     if order and len(parts) % len(order):
         raise RecordingError(
             f"names {several(len(order), 'electrode')}, but the record has "
@@ -266,7 +270,7 @@ def _parts(
             field="electrode",
             remedy="Name them in the order in which they fire, and record whole rounds",
         )
-    return parts, [order[i % len(order)] if order else "" for i in range(len(parts))]
+    return parts, [order[i % len(order)] if order else "" for i in range(len(parts))], cut
 
 
 def _used(name: str, signal: Signal, said: str, by: str) -> tuple[Used, float]:
@@ -343,9 +347,10 @@ def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dic
     )
     if not fits:
         sizes = ", ".join(
-            f"{name} has {channels[name].size}"
-            + f", of which {len(rows)} are used" * (signals[name].rows is not None)
-            + f" ({signals[name].channel!r})"
+            f"{name}: {channels[name].size} ({signals[name].channel!r})"
+            if signals[name].rows is None
+            else f"{name}: {several(len(rows), 'row')} of {signals[name].channel!r} with "
+            f"{channels[name].length} samples"
             for name, rows in rows_of.items()
         )
         raise RecordingError(

@@ -89,7 +89,7 @@ class Channel:
         if len(self.shape) == 1:
             return f"{self.length} samples"
         if len(self.shape) == 2:
-            return f"{self.shape[0]} trials of {self.length} samples"
+            return f"{several(self.shape[0], 'trial')} of {self.length} samples"
         return f"an array of {' x '.join(map(str, self.shape))} numbers"
 
     def blocks(self, trial: int = 0) -> Iterator[np.ndarray]:

@@ -153,7 +153,7 @@ def _say_units(
     """
     for name in CHANNELS:
         implied = {
-            file: {**tables[file].get(name, common.get(name)), "unit": one.signals[name].unit}
+            file: {**(tables[file].get(name) or common[name]), "unit": one.signals[name].unit}
             for file, of in files.items()
             for one in of
             if name in one.signals and one.signals[name].unit_by == "command"

@@ -1,4 +1,4 @@
-"""Import of files of other formats into files of recordings, and of measured impedances.
+"""Import of files of other formats into files of recordings.
 
 A reader for each format (`etid.files.readers`) lists the channels of a file. A mapping
 (`etid.files.mapping`) assigns channels to signals. `etid.files.assemble` makes recordings from the
@@ -11,9 +11,6 @@ import os
 import pathlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
-
-import numpy as np
-from jaxtyping import Complex, Float
 
 from etid.files import formats
 from etid.files.assemble import Imported, sources_of
@@ -28,7 +25,7 @@ from etid.files.mapping import (
     recordings_of,
 )
 from etid.files.readers import delimited, npz
-from etid.recordings.errors import optional, require_file
+from etid.recordings.errors import require_file
 from etid.recordings.fields import DECLARED, LABELS, Metadata
 from etid.recordings.recording import AbstractSource, RecordingError, check_rates
 from etid.recordings.study import Study, refuse_nested
@@ -322,41 +319,3 @@ def _found(file: str, root: pathlib.Path | None) -> pathlib.Path:
             remedy="Write the path of the one that is meant in full",
         )
     return paths[0]
-
-
-# --- Measured impedances --------------------------------------------------------------------------
-
-
-def read_impedance(
-    path: str | os.PathLike[str], instrument: str | None = None
-) -> tuple[Float[np.ndarray, " frequency"], Complex[np.ndarray, " frequency"]]:
-    """Frequencies [Hz] and impedance [Ω] of a file, for `identify_impedance`.
-
-    Args:
-        path: The file.
-        instrument: Program that wrote it: `gamry`, `autolab`, `parstat`, `zplot`, `versastudio`,
-            `powersuite`, `biologic` or `chinstruments`. If not given, the file is a table of
-            frequency, real and imaginary part with commas, without a header.
-
-    Raises:
-        RecordingError: The file cannot be read, the instrument is not known, or the package
-            impedance is not installed.
-    """
-    file = pathlib.Path(path)
-    instruments = (
-        "gamry", "autolab", "parstat", "zplot", "versastudio", "powersuite", "biologic",
-        "chinstruments",
-    )  # fmt: skip
-    if instrument is not None and instrument not in instruments:
-        raise RecordingError(
-            f"is {instrument!r}", field="instrument", remedy=f"Use one of {', '.join(instruments)}"
-        )
-    require_file(str(file))
-    readers = optional("impedance.preprocessing", "eis", str(file), "impedance")
-    # The readers raise any error for a file of another instrument, even UnboundLocalError.
-    with located(str(file), remedy="Name its instrument"):
-        frequency, impedance = readers.readFile(str(file), instrument)
-        frequency, z = np.asarray(frequency, float), np.asarray(impedance, complex)
-        if frequency.size == 0 or frequency.shape != z.shape:
-            raise RecordingError("holds no impedances", remedy="Name the instrument")
-    return frequency, z

@@ -324,6 +324,7 @@ class Scan:
             )
         if shape is None or len(shape) not in (1, 2) or 0 in shape:
             what = "is empty" if shape is None or 0 in shape else f"has shape {shape}"
+            what = "is one number" if shape == () else what
             raise RecordingError(what, remedy=f"The schema requires {field.expects}")
         if shape[-1] > limits.SAMPLES or (shape[0] > limits.TRIALS and len(shape) == 2):
             raise RecordingError(

@@ -105,7 +105,8 @@ class Field:
         """Text for errors: name, unit, type, shape and allowed values."""
         unit = f" [{self.unit}]" if self.unit else ""
         values = f", one of {', '.join(map(repr, self.values))}" if self.values else ""
-        return f"{self.name}{unit}: {self.type} of shape {self.shape}{values}"
+        shape = "" if self.shape == "()" else f" of shape {self.shape}"
+        return f"{self.name}{unit}: {self.type}{shape}{values}"
 
     @property
     def empty(self) -> Any:

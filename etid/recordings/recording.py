@@ -250,7 +250,7 @@ class Recording(Overviewed, AbstractFields):
         with located(path=self.path):
             cause = self.v_th if trigger is None else self.samples[self.cause].values
             given = None if trigger is None else np.asarray(trigger, float)
-            parts = split(cause, self.sample_rate, self.pulse_rate, given)
+            parts = split(cause, self.sample_rate, self.pulse_rate, given).whole
         whole = self.path or self.metadata.kind
         return [
             self.replace(

@@ -1,5 +1,7 @@
 """Parts of one long record: by pauses between its pulses, a trigger, or what says who fires."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -10,6 +12,18 @@ from etid.signals.pulse_train import find_pulses
 WHOLE = 0.1  # largest distance of a value from the whole number that it means
 
 
+class Parts(NamedTuple):
+    """The parts of a record.
+
+    Attributes:
+        whole: Those with all their samples.
+        cut: How many were left out, because an end of the record cuts them.
+    """
+
+    whole: list[slice]
+    cut: int
+
+
 def split(
     cause: Float[np.ndarray, " time"],
     sample_rate: float,
@@ -18,7 +32,7 @@ def split(
     which: Float[np.ndarray, " _"] | None = None,
     *,
     cut: bool = True,
-) -> list[slice]:
+) -> Parts:
     """The parts of a record, each with whole pulse periods.
 
     Without a trigger, a part is a train of pulses between pauses. With one, a part has the pulses
@@ -38,7 +52,7 @@ def split(
 
     Raises:
         RecordingError: There are no pauses, no pulses behind an edge of the trigger, or an end of
-            the record cuts a train that may not be left out.
+            the record cuts a train that may not be left out, or all of them.
     """
     period = sample_rate / pulse_rate
     edges = find_pulses(cause, sample_rate, pulse_rate).edges
@@ -64,12 +78,12 @@ def split(
     stops = [at + round(len(train) * period) for at, train in zip(starts, trains, strict=True)]
     both = zip(starts, stops, strict=True)  # an end of the record may cut a train
     whole = [slice(start, stop) for start, stop in both if start >= 0 and stop <= cause.size]
-    if not cut and len(whole) < len(trains):
+    if not whole or (not cut and len(whole) < len(trains)):
         raise RecordingError(
             "an end of the record cuts the first or the last train of pulses",
             remedy="Record a period without pulses before the first and behind the last",
         )
-    return whole
+    return Parts(whole, len(trains) - len(whole))
 
 
 def firing(

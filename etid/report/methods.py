@@ -5,7 +5,6 @@ uses; the sentences around them are in `templates/methods.txt`. The entries to c
 `citations.bib` and are printed unchanged, except for the version of etid.
 """
 
-import importlib.metadata
 import importlib.resources
 import itertools
 import pathlib
@@ -103,7 +102,7 @@ def _facts(
         "formula": fits.circuit.formula,
         "words": words(_method(found)),
         "automatic": fits.fit.method == joined([str(MAXIMUM_LIKELIHOOD), str(OUTPUT_ERROR)]),
-        "version": importlib.metadata.version("etid"),
+        "version": etid.__version__,
         "succeeded": succeeded(fits),
         "typical": typical,
         "candidates": candidates,
@@ -196,4 +195,4 @@ def bibtex(keys: Iterable[str]) -> str:
     if unknown:
         raise KeyError(f"citations.bib has no entry {', '.join(sorted(unknown))}")
     text = "\n\n".join(entry for key, entry in known.items() if key in wanted)
-    return text.replace("{VERSION}", f"{{{importlib.metadata.version('etid')}}}")
+    return text.replace("{VERSION}", f"{{{etid.__version__}}}")

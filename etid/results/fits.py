@@ -1,7 +1,6 @@
 """A table of many fits, its labels, its file, and medians, spreads and errors of its groups."""
 
 import dataclasses
-import importlib.metadata
 import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,6 +9,7 @@ from typing import Any, Generic
 import jax
 import numpy as np
 
+import etid
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.circuits.display import heading, several
 from etid.circuits.lookup import class_path
@@ -230,7 +230,7 @@ class Fits(Overviewed, Generic[Circuit]):
         attributes = {
             "schema": SCHEMA,
             "schema_version": VERSION,
-            "etid_version": importlib.metadata.version("etid"),
+            "etid_version": etid.__version__,
             "circuit": class_path(type(self.circuit)),
             "parameters": list(self.circuit.names()),
             "method": self.fit.method,

@@ -21,6 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+import etid
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import rounded, several
 from etid.circuits.overview import ROWS, Overview, Overviewed
@@ -99,8 +100,16 @@ def sha256(path: str | os.PathLike[str]) -> str:
 @functools.cache
 def versions() -> tuple[str, ...]:
     """Packages and their versions; to look them up on disk takes as long as three skins."""
-    packages = ("etid", "jax", "jaxlib", "optimistix", "equinox", "numpy")
-    return tuple(f"{name} {importlib.metadata.version(name)}" for name in packages)
+    packages = ("jax", "jaxlib", "optimistix", "equinox", "numpy")
+    return (f"etid {etid.__version__}", *(f"{name} {_version(name)}" for name in packages))
+
+
+def _version(package: str) -> str:
+    """Version of a package; one on a search path that was never installed does not say it."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "of unknown version"
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -252,8 +252,8 @@ def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Co
         yield contents
 
 
-def _refuse_another(path: pathlib.Path) -> None:
-    """Raise an error that says what to confirm if a table looks different from the default."""
+def _start(path: pathlib.Path) -> tuple[list[str], str]:
+    """The first lines of a table, and their encoding."""
     with path.open("rb") as file:
         start = file.read(1 << 16)
     encoding = Dialect.encoding
@@ -261,7 +261,17 @@ def _refuse_another(path: pathlib.Path) -> None:
         codecs.getincrementaldecoder(encoding)().decode(start)
     except UnicodeDecodeError:
         encoding = "utf-16" if start[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "cp1252"
-    lines = start.decode(encoding, "replace").splitlines()[:LINES]
+    return start.decode(encoding, "replace").splitlines()[:LINES], encoding
+
+
+def likely_dialect(path: pathlib.Path) -> Dialect | None:
+    """The dialect in which a table has rows of numbers; None if no dialect has them."""
+    return _guessed(*_start(path))
+
+
+def _refuse_another(path: pathlib.Path) -> None:
+    """Raise an error that says what to confirm if a table looks different from the default."""
+    lines, encoding = _start(path)
     likely = _guessed(lines, encoding)
     if likely is None or likely == Dialect():
         return

@@ -51,7 +51,7 @@ class _Variable:
 
     shape: tuple[int, ...] = ()
     dtype: np.dtype = dataclasses.field(default_factory=lambda: np.dtype(float))
-    part: Callable[[tuple[int | slice, ...]], np.ndarray] = np.empty
+    part: Callable[[tuple[int | slice, ...]], np.ndarray] = lambda index: np.empty(0)
     kind: str = ""
     check: Callable[[], None] = lambda: None
 
