@@ -20,6 +20,7 @@ from pyarrow import parquet
 import etid
 from etid import cli
 from etid.files import exporting
+from etid.recordings.recording import Samples
 from etid.results.fits import Fits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
@@ -170,7 +171,8 @@ def study_file(tmp_path):
     known = (Trial("calibration/98k8", ResistorLoad(98.8e3), "s01"),)
     shared = Scene(trials, known, samples=400, shared_v_th=True).simulate(1)
     v_th, v_out, current = np.random.default_rng(2).normal(size=(3, 400))
-    damp = etid.Recording(v_th, v_out, current=current, path="s01/damp", electrode="E1",
+    codes = Samples((1000 * v_out).astype("i2"), 1e-3, 0.25)  # a converter whose zero is not 0 V
+    damp = etid.Recording(v_th, codes, current=current, path="s01/damp", electrode="E1",
                           subject="s01", sample_rate=200e3, pulse_rate=60.0)  # fmt: skip
     etid.Study.from_recordings([*shared.recordings(), damp]).write(tmp_path / "study.h5")
     return tmp_path / "study.h5"
@@ -185,6 +187,7 @@ def test_nwb_holds_what_was_stored_and_all_that_was_said(study_file, tmp_path):
         assert file.subject.subject_id == "s01"
         table = file.acquisition["recordings"].to_dataframe().set_index("path")
         assert list(table.index) == list(study)
+        assert study["s01/damp"].samples["v_out"].offset == 0.25
         for path, recording in study.items():
             row = table.loc[path]
             for name, record in recording.samples.items():
@@ -242,7 +245,7 @@ def test_a_missing_package_is_named_with_its_extra(
         ("study.h5 -o t.csv", "schema: is 'etid/recording', not 'etid/fits'"),
         ("fits.h5 -o t.xlsx", "t.xlsx: the file is not written as .xlsx; name it t.csv"),
         ("fits.h5 -o t.abc", "t.abc: fits are exported as .csv or .parquet, not '.abc'"),
-        ("fits.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "schema: is 'etid/fits'"),
+        ("fits.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "schema: is a file of fits"),
         ("absent.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "no such file"),
         ("empty.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "empty.h5: holds no recording"),
         ("study.h5 -o t.nwb", "session_start: is not given with a time zone"),

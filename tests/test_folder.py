@@ -3,8 +3,9 @@ import pytest
 
 import etid
 from etid.cli import main
-from etid.files.folder import import_folder, labelled
+from etid.files.folder import import_folder
 from etid.files.importing import import_file
+from etid.files.labels import labelled
 from etid.files.pattern import pattern
 from etid.recordings.recording import RecordingError
 from etid.recordings.resistance import resistance
@@ -204,3 +205,85 @@ def test_an_electrode_without_a_calibration_among_several_is_refused(tmp_path):
     with pytest.raises(RecordingError, match=message):
         import_folder(tmp_path, tmp_path / "study.h5", patterns, scale=1.0, **ARRAY)
     assert not (tmp_path / "study.h5").exists()
+
+
+def channel(path, name, *columns):
+    """A file with one channel, or several."""
+    names = name.split(",")
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=",".join(names), comments="")
+
+
+ONE = {"v_out": "CH2", "sample_rate": 18e3, "pulse_rate": 60.0, "scale": 1.0}
+
+
+@pytest.fixture
+def apart(tmp_path):
+    """A folder with V_th in files of its own: one for all, and one for each trial."""
+    root = tmp_path / "apart"
+    root.mkdir()
+    channel(root / "open.csv", "CH1", pulses(9.0))
+    for trial, height in (("1", 1.0), ("2", 2.0)):
+        channel(root / f"open_{trial}.csv", "CH1", pulses(height))
+        channel(root / f"skin_{trial}.csv", "CH2", pulses(height / 2))
+    channel(root / "open_98k8.csv", "CH1", pulses(4.0))
+    channel(root / "cal_98800.csv", "CH2", pulses(3.0))
+    return root
+
+
+def test_v_th_of_all_trials_may_be_a_file_of_the_folder(apart, tmp_path, monkeypatch):
+    target, again = tmp_path / "study.h5", tmp_path / "again.h5"
+    patterns = ["skin_{trial}.csv", "cal_{r_load}.csv"]
+    found = import_folder(apart, target, patterns, v_th="open.csv:CH1", **ONE)
+    assert found.unmatched == ["open_1.csv", "open_2.csv", "open_98k8.csv"]
+    with etid.read(target) as study:
+        assert {one.v_th.max() for one in study.recordings()} == {9.0}
+        assert study["loaded/2"].v_out.max() == 1.0
+    import_file(apart, again, found.mapping)
+    assert target.read_bytes() == again.read_bytes()
+    # A path from the current folder names the same file.
+    monkeypatch.chdir(tmp_path)
+    found = import_folder(apart, again, patterns, v_th="apart/open.csv:CH1", **ONE)
+    assert found.unmatched == ["open_1.csv", "open_2.csv", "open_98k8.csv"]
+    channel(tmp_path / "open.csv", "CH1", pulses(8.0))
+    with pytest.raises(
+        RecordingError, match=r"there is a file 'open\.csv' in the folder .* and in"
+    ):
+        import_folder(apart, again, patterns, v_th="open.csv:CH1", **ONE)
+
+
+def test_v_th_may_have_a_file_for_each_trial_and_resistor(apart, tmp_path):
+    target, again = tmp_path / "study.h5", tmp_path / "again.h5"
+    words = ["import", str(apart), "-o", str(target), "--v-th", "open_{trial}.csv:CH1"]
+    words += ["--labels", "cal_{r_load}.csv", "--labels", "{condition}_{trial}.csv"]
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in ONE.items()]
+    assert main([*words, *options]) == 0
+    with etid.read(target) as study:
+        heights = {path: (one.v_th.max(), one.v_out.max()) for path, one in study.items()}
+    assert heights == {
+        "calibration/98800": (4.0, 3.0), "skin/1": (1.0, 0.5), "skin/2": (2.0, 1.0),
+    }  # fmt: skip
+    import_file(apart, again, target.with_suffix(".toml"))
+    assert target.read_bytes() == again.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("v_th", "patterns", "message"),
+    [
+        ("open_{subject}.csv:CH1", "skin_{trial}.csv", "has the subject of this file, whose name"),
+        ("opn_{trial}.csv:CH1", "skin_{trial}.csv", "v_th: no file of the folder matches 'opn_"),
+        ("opn.csv:CH1", "skin_{trial}.csv", "v_th: there is no file 'opn.csv' in the folder"),
+        ("open.csv:CH3", "skin_{trial}.csv", "there is no 'open.csv:CH3'; the names are 'CH2', 'o"),
+        ("open_{trail}.csv:CH1", "skin_{trial}.csv", "trail: is no label, did you mean trial"),
+    ],
+)
+def test_refusals_of_a_further_file(v_th, patterns, message, apart, tmp_path):
+    with pytest.raises(RecordingError, match=message) as caught:
+        import_folder(apart, tmp_path / "study.h5", patterns, v_th=v_th, **ONE)
+    assert caught.value.remedy
+    assert not (tmp_path / "study.h5").exists()
+
+
+def test_a_single_file_does_not_fill_in_labels(apart, tmp_path):
+    for v_th, remedy in (("open_{trial}.csv:CH1", "for a folder, with --labels"), ("a.csv:b", "")):
+        with pytest.raises(RecordingError, match=rf"there is no file .* current folder.*{remedy}"):
+            import_file(apart / "skin_1.csv", tmp_path / "study.h5", v_th=v_th, **ONE)

@@ -236,6 +236,13 @@ def test_a_table_that_ends_inside_a_number_is_taken_with_a_notice(sign, between,
     refused(lab_files.table(tmp_path, refused_end), "has 2 cells; the table has", **told)
 
 
+def test_a_last_number_that_is_shorter_than_some_above_may_be_whole(tmp_path):
+    text = "th,out\n0.125,0.0625\n0.5,0.25\n0.25,{}"
+    for last, noticed_one in (("0.125", False), ("0.25", False), ("0.2", True)):
+        path = lab_files.table(tmp_path, text.format(last))
+        assert bool(noticed(path)[1]) == noticed_one, last
+
+
 def test_the_preamble_of_an_oscilloscope_is_compared_with_its_table(tmp_path):
     body = "t [s],th [V],out [V]\n" + "".join(rows())
 

@@ -197,6 +197,17 @@ def test_a_long_record_is_split_at_its_pauses(tmp_path):
         assert one.path == f"long/{one.trial}"
 
 
+def test_all_trials_of_a_resistor_are_calibrations_of_every_trial(tmp_path):
+    th, out = pulses()
+    np.savez(tmp_path / "known.npz", th=th, out=np.stack([out, out]))
+    arrays = {"th": th, "out": np.stack([out, out / 2, out / 3])}
+    calibrations = {tmp_path / "known.npz": "98k8"}
+    recordings, _ = of_arrays(tmp_path, arrays, calibrations=calibrations)
+    known = tuple(one.path for one in recordings if one.r_load == 98.8e3)
+    assert known == ("calibration/known/0", "calibration/known/1")
+    assert [one.calibration for one in recordings[2:]] == [known] * 3
+
+
 def in_turn(rests=(2000, 2000)):
     """Four trains of three pulses: two electrodes in two rounds, and which one fires."""
     trains = [pulses(3, before=before)[0] for before in (rests[0], 500, 500, 500)]

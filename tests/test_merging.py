@@ -1,5 +1,6 @@
 """Files of recordings become one, and each recording keeps its calibration."""
 
+import h5py
 import numpy as np
 import pytest
 
@@ -55,3 +56,26 @@ def test_a_recording_without_v_th_needs_no_calibration(tmp_path):
         etid.Study.from_recordings([one]).write(tmp_path / name)
     counts = merge_files([tmp_path / "known.h5", tmp_path / "dry.h5"], tmp_path / "study.h5")
     assert counts == {"known": 1, "dry": 1}
+
+
+def test_of_two_calibrations_of_its_file_a_recording_that_names_none_gets_none(tmp_path):
+    known, dry, *_ = etid.scenes.paper_dry(samples=400).simulate(1).recordings()
+    two = [known.replace(path=f"calibration/{name}") for name in "ab"]
+    named = dry.replace(path="named", calibration=("calibration/b",))
+    source, target = tmp_path / "s.h5", tmp_path / "study.h5"
+    etid.Study.from_recordings([*two, dry.replace(calibration=()), named]).write(source)
+    merge_files([source], target)
+    with etid.read(target) as merged:
+        assert merged[f"s/{dry.path}"].calibration == ()
+        assert merged["s/named"].calibration == ("s/calibration/b",)
+
+
+def test_a_file_with_a_broken_recording_is_not_merged(tmp_path):
+    known, dry, *_ = etid.scenes.paper_dry(samples=400).simulate(1).recordings()
+    source = tmp_path / "s.h5"
+    etid.Study.from_recordings([known, dry]).write(source)
+    with h5py.File(source, "r+") as file:
+        del file[f"{dry.path}/v_out"].attrs["unit"]
+    with pytest.raises(etid.RecordingError, match=r"v_out\.unit: is missing"):
+        merge_files([source], tmp_path / "study.h5")
+    assert not (tmp_path / "study.h5").exists()

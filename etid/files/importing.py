@@ -305,17 +305,17 @@ def _found(file: str, root: pathlib.Path | None) -> pathlib.Path:
     """Path of a further file, in the folder that is imported or in the current one."""
     folders = [pathlib.Path()] if root is None else [root, pathlib.Path()]
     paths = [folder / file for folder in folders if (folder / file).is_file()]
-    named = f"the folder {str(root)!r} and in the current folder"
     if not paths:
+        where = "" if root is None else f"the folder {str(root)!r} or in "
         raise RecordingError(
-            f"there is no file {file!r} in {'the current folder' if root is None else named}",
+            f"there is no file {file!r} in {where}the current folder",
             remedy="Labels in the name of a further file are for a folder, with --labels"
             if "{" in file
             else "Write its path as seen from there",
         )
     if not paths[0].samefile(paths[-1]):
         raise RecordingError(
-            f"there is a file {file!r} in {named}",
+            f"there is a file {file!r} in the folder {str(root)!r} and in the current folder",
             remedy="Write the path of the one that is meant in full",
         )
     return paths[0]
