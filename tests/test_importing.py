@@ -156,7 +156,7 @@ SHIFTED = "t,th,out{0}\n0,1.5,2.5{0}\n{1}\n0,1.5,2.5{0}\n"
         ("th,out\n1,2\n\n3,x\n", {}, "line 4 has 'x' in column 2, must be a number"),
         ("th,out\n" + 70000 * "1,2\n" + "3,x\n", {}, "line 70002 has 'x' in column 2"),
         ("th,out\n1,2\n3,\n", {}, "line 3 has '' in column 2"),
-        ("th,out\n1,2\n3\n", {}, "line 3 has 1 cells"),
+        ("th,out\n1,2\n3\n", {}, "line 3 has 1 cell;"),
         ("th;out\n1;2\n", {}, "there is no 'th'; the names are 'th;out'"),
         ("th,out,th\n1,2,3\n", {}, "2 columns have the name 'th'.*: 'th#1' or 'th#3'"),
         ("th,out\n1,2\n\xff", {}, "cannot be read"),

@@ -275,7 +275,7 @@ def test_a_train_that_an_end_of_the_record_cuts_is_left_out_with_a_note(tmp_path
         ({"split": "what", "electrode": "E{what}"}, "there is no 'what'"),
         ({"split": "pulses", "electrode": "E{which}"}, "is .* not split by a channel"),
         ({"electrode": "E{which}"}, "electrode: is 'E{which}', but the record is not"),
-        ({"split": "which", "electrode": "E{which}", "trial": 3}, "1 labels for 4 trials"),
+        ({"split": "which", "electrode": "E{which}", "trial": 3}, "has 1 label for 4 trials"),
         ({"split": "pulses", "v_out": "stack"}, "can be split"),
     ],
 )  # fmt: skip

@@ -119,7 +119,7 @@ A, B = "[[recording]]\npath = 'a'\n", "[[recording]]\npath = 'b'\n"
         ('"rig/skin"', '"rig/skin", scale = 0', r"v_out\.scale: is 0, must be"),
         ("scale", 'current = {channel = "rig/shunt"}\nscale', "unit: .* in volt.*per ampere"),
         ("scale", 'time = {channel = "rig/open"}\nscale', "time.unit: .*must be in second"),
-        ("scale", "trial = [1, 2]\nscale", "trial: has 2 labels for 1 trials"),
+        ("scale", "trial = [1, 2]\nscale", "trial: has 2 labels for 1 trial"),
         ("scale", 'path = "../x"\nscale', "path: '../x' cannot be the path"),
         ("scale", "recording = 3\nscale", "recording: must be a list of tables"),
         ("scale", "scale = ", "is not TOML"),
