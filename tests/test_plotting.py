@@ -5,6 +5,7 @@ import functools
 import json
 
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
@@ -16,7 +17,7 @@ from etid.estimators.lanes import Harmonics
 from etid.plotting import figure_of
 from etid.plotting.bands import CLEAR, bands
 from etid.plotting.pulses import pulse, residual_std
-from etid.plotting.style import RED, new_figure
+from etid.plotting.style import COLOURS, RED, new_figure
 from etid.recordings.preflight import Inspected
 from tests import pictures
 
@@ -92,7 +93,7 @@ def test_a_fit_shows_its_residual_in_millivolts_in_a_band_of_two_sigma(recording
     assert isinstance(band, Rectangle)
     sigma = 1e3 * residual_std(recording, driver, fit.circuit)
     np.testing.assert_allclose((band.get_y(), band.get_height()), (-2 * sigma, 4 * sigma))
-    assert r"successful, chi2 1.02, RRSE 0.1 %" in title(upper)
+    assert r"successful, χ² 1.02, RRSE 0.1 %" in title(upper)
     assert r"$R_\mathrm{s}$ 33.40 ± 0.67 kΩ" in title(upper)
     for given, shown in ((None, ""), ("dry", "dry")):
         drawn = etid.plot(fit, recording, driver, title=given)
@@ -312,3 +313,100 @@ def test_the_residual_of_a_wrong_circuit_correlates_with_the_unloaded_voltage(re
         outside.append(np.mean(np.abs(ends[:, 1]) > band.get_height() / 2))
         assert dict(segment[1] for segment in of_own.get_segments())[0.0] == pytest.approx(1.0)
     assert outside[0] < 0.05 < 0.5 < outside[1]
+
+
+def colours(axis):
+    """Colours of the lines of a panel."""
+    return [to_hex(line.get_color()) for line in axis.lines]
+
+
+def test_red_is_what_has_no_success_and_nothing_else():
+    """A failed driver was blue, and the good one beside it red and dashed."""
+    both = {"bad": pictures.driver("misfit"), "good": pictures.driver()}
+    for axis in figure_of(both).axes:
+        bad, good = colours(axis)
+        assert bad == RED != good
+    assert RED not in [to_hex(one) for one in COLOURS]
+
+
+@pytest.mark.parametrize("name", [n for n in pictures.PICTURES if not n.startswith("report")])
+def test_letters_are_legible_in_400_pixels(name):
+    """Of 10 points, in a picture of 7.5 inch: 7.4 pixels; a figure of 12 inch had 4.6."""
+    figure = pictures.drawn(name)
+    assert 400 / figure.get_figwidth() * 10 / 72 >= 6.9  # posterior: 7.8 inch
+
+
+def test_ticks_close_to_each_other_are_whole_numbers():
+    """The axis said +1.858e2."""
+    profile = dataclasses.replace(
+        pictures.profile(),
+        value=0.1858e-9,
+        values=0.1858e-9 * (1 + 1e-5 * np.linspace(-1, 1, 29)),
+        stderr=1e-15,
+    )
+    figure = figure_of(profile)
+    figure.draw_without_rendering()
+    assert figure.axes[0].xaxis.get_offset_text().get_text() == ""
+
+
+def test_a_colour_bar_of_a_short_range_has_several_ticks():
+    figure = pictures.drawn("report_electrodes")  # C_p from 0.09 to 0.12 nF
+    figure.draw_without_rendering()
+    bar = figure.axes[-1]
+    low, high = bar.get_ylim()
+    assert sum(low <= tick <= high for tick in bar.get_yticks()) >= 2
+
+
+def test_fits_say_their_errors_what_is_pooled_and_what_stands_beside_the_points():
+    fits = pictures.fits()
+    days = np.resize(np.array(["d1", "d2"], object), len(fits))
+    fits = dataclasses.replace(fits, labels={**fits.labels, "session": days})
+    axis = figure_of(fits).axes[0]
+    assert "pooled: sessions" in title(axis)
+    assert "beside the points: trial" in title(axis)
+    assert "median error 2 %" in [one.get_text() for one in axis.texts]
+    assert axis.get_ylabel() == r"$R_\mathrm{s}$ [kΩ]"
+    assert "Each row pools sessions." in str(fits)
+    of_days = title(figure_of(fits, by=("session", "subject")).axes[0])
+    assert "pooled: conditions" in of_days
+    assert "sessions" not in of_days
+
+
+def test_equal_labels_do_not_stand_beside_the_points():
+    """At the electrodes of a display each point said 0."""
+    fits = pictures.display()
+    labels = {**fits.labels, "trial": np.full(len(fits), "0", object)}
+    axis = figure_of(dataclasses.replace(fits, labels=labels)).axes[0]
+    beside = {one.get_text() for one in axis.texts} & {"0", "E1", "E8", "E9", "E98"}
+    assert beside == {"E1", "E8", "E9", "E98"} & beside != set()
+    assert "beside the points: electrode" in title(axis)
+
+
+def spectrum():
+    """The impedance that an instrument measured, without its fit."""
+    measured = pictures.measured().measured
+    assert measured is not None
+    return measured
+
+
+@pytest.mark.parametrize(
+    ("method", "function"),
+    [
+        (lambda: pictures.dry().plot(), lambda: etid.plot(pictures.dry())),
+        (lambda: pictures.driver().plot(), lambda: etid.plot(pictures.driver())),
+        (
+            lambda: pictures.driver().plot(pictures.study()["calibration/98k8"], title="one"),
+            lambda: etid.plot(pictures.driver(), pictures.study()["calibration/98k8"], title="one"),
+        ),
+        (
+            lambda: spectrum().plot(size=(4.0, 6.0)),
+            lambda: etid.plot(spectrum(), size=(4.0, 6.0)),
+        ),
+    ],
+)
+def test_a_method_draws_what_the_function_draws(method, function):
+    figures = [draw()[0].figure for draw in (method, function)]
+    plt.close("all")
+    one, other = map(pictures.described, figures)
+    pictures.compare(one, other)
+    assert figures[0].get_size_inches().tolist() == figures[1].get_size_inches().tolist()

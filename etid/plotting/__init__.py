@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from etid.plotting.layout import Layout
     from etid.plotting.style import Canvas
 
-    One = Recording | Fits | Selection | Posterior | Profile | Bound | Impedance
+    One = Recording | MeasuredImpedance | Fits | Selection | Posterior | Profile | Bound | Impedance
     Drawable = One | Mapping[str, Bound] | Mapping[str, Impedance]
 else:
     Drawable = Any
@@ -58,6 +58,7 @@ def plot(
     | `plot(fit, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
     | `plot(fit, show="residual")` | residual [mV], its correlations | 3 |
     | `plot(fit)` of `identify_impedance` | Nyquist and Bode: fit, measured | 3 |
+    | `plot(fit.measured)` | Nyquist and Bode: measured | 3 |
     | `plot(fits[0], recording, driver)` | as `plot(fit)`, for one of several fits | 2 |
     | `plot(fits[0], recording)` | that for a fit from a measured current | 2 |
     | `plot(selection, recording, driver)` | impedance measured, and each candidate | 4 |
@@ -188,6 +189,8 @@ def _draw(
                 return pulses.draw_calibration(canvas, x, recording)
             case Fit(measured=MeasuredImpedance() as measured), None, _:
                 return judging.draw_measured(canvas, x, measured)
+            case MeasuredImpedance(), None, None:
+                return judging.draw_measured(canvas, None, x)
             case Fit(), _, _:
                 raise TypeError(
                     "this fit does not know its recording: plot(fit, recording, driver). "

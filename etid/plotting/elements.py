@@ -6,13 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import DISPLAY, several
+from etid.circuits.display import DISPLAY, per_cent, several
 from etid.plotting.style import (
     BLUE,
     COLOURS,
     INK,
     MARKS,
     NARROW,
+    ORANGE,
     RED,
     Canvas,
     drawable,
@@ -62,6 +63,8 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     summary = [one for one in fits.summary(*by) if one["successful"] >= 3]
     middle = [groups.tolist().index(one[by[0]]) + beside[one[by[1]]] for one in summary]
     good = fits.verdicts == "successful"
+    room = len(fits) <= 40 and axes[0].figure.get_figwidth() > 5
+    beside_points = _distinct(fits, by) if room else ""
     for axis, (name, unit) in zip(axes, units.items(), strict=True):
         scale = DISPLAY[unit][0]
         values = np.asarray(getattr(fits.circuit, name)) / scale
@@ -83,21 +86,29 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
         axis.set_yscale("log")
         shown = known
         if (good & known).any():  # an undetermined element may lie decades away
-            low, high = values[good & known].min() / 2, values[good & known].max() * 2
+            low, high = values[good & known].min() / 1.4, values[good & known].max() * 1.4
+            high *= (high / low) ** 0.2  # room for the texts above the points
             axis.set_ylim(low, high)
             shown = known & (values > low) & (values < high)
         plain_ticks(axis.yaxis)
         hidden = {"without success outside": known & ~shown, "without elements": ~known}
         told = [f"{of.sum()} {where}" for where, of in hidden.items() if of.any()]
+        sizes = (errors / values)[good & known & (errors > 0)]
+        if sizes.size:  # on an axis of decades the bars of small errors are hidden by their points
+            axis.text(
+                0.005, 0.97, f"median error {per_cent(float(np.median(sizes)))}", color="0.35",
+                fontsize=8, transform=axis.transAxes, va="top",
+            )  # fmt: skip
         axis.text(
             0.995, 0.97, ", ".join(told), color=RED, fontsize=8, transform=axis.transAxes,
             ha="right", va="top",
         )  # fmt: skip
-        if len(fits) <= 40 and axis.figure.get_figwidth() > 5:  # room for the names of the trials
+        if beside_points:
             for row in np.flatnonzero(shown):
+                told_apart = plain(str(fits.labels[beside_points][row]))
                 axis.annotate(
-                    plain(str(fits.labels["trial"][row])), (x[row], values[row]), xytext=(4, 3),
-                    textcoords="offset points", fontsize=7, color="0.35",
+                    told_apart, (x[row], values[row]), xytext=(4, 3), textcoords="offset points",
+                    fontsize=7, color="0.35",
                 )  # fmt: skip
         axis.set_ylabel(symbol(name, unit))
     names = [plain(one) or "-" for one in groups.tolist()]
@@ -108,8 +119,23 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     lines = [f"{several(len(fits), 'fit')}: {counted(fits.verdicts)}; bars: one standard error"]
     if summary:
         lines.append("thick: medians, and the variation between fits beyond their errors")
+    if beside_points:
+        lines.append(f"beside the points: {beside_points}")
+    if pooled := fits.pooled(*by):
+        lines.append(f"pooled: {', '.join(f'{name}s' for name in pooled)}")
     titled(axes[0], lines, good=bool(good.any()))
     return axes
+
+
+def _distinct(fits: Fits, by: Sequence[str]) -> str:
+    """The label that tells most fits of a group from each other; empty if none does."""
+    groups = list(zip(*(fits.labels[name].tolist() for name in by), strict=True))
+
+    def different(name: str) -> int:
+        return len(set(zip(groups, fits.labels[name].tolist(), strict=True)))
+
+    best = max((name for name in ("trial", "electrode", "session", "site")), key=different)
+    return best if different(best) > len(set(groups)) else ""
 
 
 def _legend(axes: np.ndarray, series: Sequence[str], hollow: str) -> None:
@@ -185,13 +211,13 @@ def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
                 axis.hist(draws[row], bins=bins, weights=posterior.weights, **look)
                 x = np.linspace(low[row], high[row], 200)
                 normal = statistics.NormalDist(centre[row], np.sqrt(cov[row, row]))
-                axis.plot(x, [normal.pdf(one) for one in x], color=RED, lw=1.2)
+                axis.plot(x, [normal.pdf(one) for one in x], color=ORANGE, lw=1.2)
                 axis.axvspan(*ends[row], color="0.85", lw=0, zorder=0)
                 axis.set_yticks([])
             else:
                 axis.plot(draws[column][some], draws[row][some], ".", ms=1.5, color=BLUE, alpha=0.4)
                 pick = np.ix_([column, row], [column, row])
-                axis.plot(*_ellipse(centre[[column, row]], cov[pick]), color=RED, lw=1.2)
+                axis.plot(*_ellipse(centre[[column, row]], cov[pick]), color=ORANGE, lw=1.2)
                 axis.set_ylim(low[row], high[row])
                 axis.locator_params(axis="y", nbins=5)
             if 0 == column < row:
@@ -199,7 +225,7 @@ def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
             axis.tick_params(labelbottom=row == count - 1, labelleft=column == 0)
             if row == count - 1:
                 axis.set_xlabel(labels[column])
-    grid[0, 0].plot([], [], color=RED, lw=1.2, label="errors of the fit\n(ellipses: 95 %)")
+    grid[0, 0].plot([], [], color=ORANGE, lw=1.2, label="errors of the fit\n(ellipses: 95 %)")
     grid[0, 0].legend(loc="upper left", bbox_to_anchor=(1.02, 1)).set_in_layout(False)
     title = (
         f"{several(posterior.weights.size, 'draw')}, worth {posterior.effective:.0f}; shaded: 95 %"
@@ -226,7 +252,7 @@ def draw_profile(canvas: Canvas, profile: Profile) -> np.ndarray:
     limit = statistics.NormalDist().inv_cdf((1 + LEVEL) / 2) ** 2
     axis.plot(values, profile.deviance, color=BLUE, lw=1.5, label="other parameters fitted again")
     parabola = ((profile.values - profile.value) / profile.stderr) ** 2
-    axis.plot(values, parabola, "--", color=RED, lw=1.2, label="fit ± standard error")
+    axis.plot(values, parabola, "--", color=ORANGE, lw=1.2, label="fit ± standard error")
     axis.axhline(limit, color=INK, lw=0.8, ls=":")
     axis.annotate(
         "95 %", (1, limit), xycoords=("axes fraction", "data"), xytext=(-2, 2),

@@ -11,7 +11,17 @@ from matplotlib.axes import Axes
 from etid.circuits.circuit import AbstractCircuit
 from etid.numpy_tier.tiers import program
 from etid.plotting import Impedance
-from etid.plotting.style import COLOURS, DASHES, Canvas, legend, nth, plain_ticks, titled, typeset
+from etid.plotting.style import (
+    COLOURS,
+    DASHES,
+    RED,
+    Canvas,
+    legend,
+    nth,
+    plain_ticks,
+    titled,
+    typeset,
+)
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.solvers.matrices import log_stderr
@@ -29,16 +39,17 @@ def draw_bode(canvas: Canvas, things: Mapping[str, Impedance]) -> np.ndarray:
     for i, (label, thing) in enumerate(things.items()):
         z, errors = map(np.asarray, _with_errors(thing, frequency))
         known = np.isfinite(errors).all()
+        look = {"color": nth(COLOURS, i), "linestyle": nth(DASHES, i), "lw": 1.3}
         if isinstance(thing, Fit | Driver):
             if thing.verdict != "successful":
                 failed.append(f"{label}: no success: {thing.verdict}")
+                look |= {"color": RED, "lw": 0.9}
             label = label if known else f"{label}, no standard error"
-        look = {"color": nth(COLOURS, i), "linestyle": nth(DASHES, i), "lw": 1.3}
         curve(magnitude, phase, frequency, z, label=typeset(label), **look)
         sizes.append(np.abs(z) / 1e3)
         if known:
             banded = True
-            band = {"color": nth(COLOURS, i), "alpha": 0.25, "linewidth": 0}
+            band = {"color": look["color"], "alpha": 0.25, "linewidth": 0}
             factor = np.exp(np.minimum(2 * errors[0], 50))  # it is finite beyond every axis
             magnitude.fill_between(kilohertz, sizes[-1] / factor, sizes[-1] * factor, **band)
             angle, turn = np.unwrap(np.angle(z)), 2 * errors[1]

@@ -21,7 +21,7 @@ from etid.plotting.style import (
     DASHES,
     INK,
     MARKS,
-    RED,
+    ORANGE,
     Canvas,
     judged,
     legend,
@@ -55,48 +55,48 @@ def draw_impedance(
 
 def _empty(canvas: Canvas, fit: Fit, path: str) -> np.ndarray:
     """Three panels of a fit without elements."""
-    axes = canvas(1, 3, (12.0, 3.8)).ravel()
+    axes = canvas.three((7.5, 4.6))
     for axis in axes:
         without_elements(axis)
-        axis.set(xticks=[])
     judged(axes[0], path, fit)
     return axes
 
 
-def draw_measured(canvas: Canvas, fit: Fit, measured: MeasuredImpedance) -> np.ndarray:
-    """Nyquist and Bode diagrams: the impedance that an instrument measured, and the fit."""
+def draw_measured(canvas: Canvas, fit: Fit | None, measured: MeasuredImpedance) -> np.ndarray:
+    """Nyquist and Bode diagrams: the impedance that an instrument measured, and the fit if any."""
     error = None if measured.stderr is None else measured.stderr / np.abs(measured.z)
     return _diagrams(canvas, fit, "", measured.frequency, measured.z, error)
 
 
 def _diagrams(
     canvas: Canvas,
-    fit: Fit,
+    fit: Fit | None,
     path: str,
     frequency: Float[np.ndarray, " point"],
     z: Complex[np.ndarray, " point"],
     stderr: Float[np.ndarray, " point"] | None,
 ) -> np.ndarray:
     """Nyquist and Bode diagrams of measured points, with standard errors of ln Z, and of a fit."""
-    nyquist, magnitude, phase = axes = canvas(1, 3, (12.0, 3.8)).ravel()
-    smooth = np.geomspace(frequency.min() / 1.3, frequency.max() * 1.3, POINTS)
-    fitted = np.asarray(fit.circuit.response(jnp.asarray(smooth)))
-    line: Any = {"color": RED, "lw": 1.3, "label": "fit"}
+    nyquist, magnitude, phase = axes = canvas.three((7.5, 4.6))
     label = "measured" if stderr is None else "measured, ± 2 standard errors"
     point: Any = {"ms": 4, "lw": 0.8, "color": BLUE, "label": label}
     size = None if stderr is None else 2 * stderr * np.abs(z) / 1e3
-    nyquist.plot(np.real(fitted) / 1e3, -np.imag(fitted) / 1e3, **line)
+    if fit is not None:
+        smooth = np.geomspace(frequency.min() / 1.3, frequency.max() * 1.3, POINTS)
+        fitted = np.asarray(fit.circuit.response(jnp.asarray(smooth)))
+        line: Any = {"color": ORANGE, "lw": 1.3, "label": "fit"}
+        nyquist.plot(np.real(fitted) / 1e3, -np.imag(fitted) / 1e3, **line)
+        curve(magnitude, phase, smooth, fitted, **line)
+        judged(nyquist, path, fit, *listed(fit))
     nyquist.errorbar(np.real(z) / 1e3, -np.imag(z) / 1e3, size, size, fmt="o", **point)
     nyquist.set(xlabel="Re Z [kΩ]", ylabel="-Im Z [kΩ]")
     nyquist.set_aspect("equal", adjustable="datalim")
-    curve(magnitude, phase, smooth, fitted, **line)
     points(magnitude, phase, frequency, z, stderr, **point)
     frame(magnitude, phase, np.abs(z) / 1e3)
     for axis in (magnitude, phase):
         axis.set(xlabel="frequency [kHz]")
     magnitude.xaxis.set_major_formatter("{x:g}")
     legend(axes)
-    judged(nyquist, path, fit, *listed(fit))
     return axes
 
 
@@ -124,7 +124,7 @@ def draw_residual(
     """
     if not listed(fit):
         return _empty(canvas, fit, recording.path)
-    whole, own, with_input = axes = canvas(1, 3, (12.0, 3.8)).ravel()
+    whole, own, with_input = axes = canvas.three((7.5, 4.6), wide=True)
     residual = predict(recording, driver, fit.circuit) - recording.v_out
     known = np.isfinite(residual)
     whole.plot(1e3 * recording.time, 1e3 * residual, color=BLUE, lw=0.5)
@@ -166,7 +166,7 @@ def draw_selection(
 ) -> np.ndarray:
     """Magnitude and phase with all candidates, and below them the deviation of each candidate."""
     ratios = {"height_ratios": [3, 1.6]}
-    axes = canvas(2, 2, (9.0, 5.2), sharex=True, gridspec_kw=ratios).ravel()
+    axes = canvas(2, 2, (7.5, 5.2), sharex=True, gridspec_kw=ratios).ravel()
     chosen = selection.candidates[0]
     fitted = [one for one in selection.candidates if listed(one.fit)]
     if chosen not in fitted:
@@ -230,7 +230,7 @@ def _deviations(magnitude: Axes, phase: Axes, found: list[Bands]) -> None:
         for number, of in enumerate(found):
             look = _look(number) | {"marker": nth(MARKS, number), "ms": 3.0}
             axis.plot(of.frequency / 1e3, of.deviation[part], **look)
-        axis.set(xlabel="frequency [kHz]", ylabel=f"deviation of\n{name} [stderr]")
+        axis.set(xlabel="frequency [kHz]", ylabel=f"{name} off\n[stderr]")
         axis.set_yscale("symlog", linthresh=plain, linscale=1.0)
         ticks = [tick for tick in (2.0, 10.0, 100.0, 1000.0, 10000.0) if tick <= largest]
         axis.yaxis.set_major_locator(FixedLocator([*(-t for t in ticks), 0.0, *ticks]))

@@ -10,7 +10,8 @@ from etid.identify.predict import predict
 from etid.plotting.style import (
     BLUE,
     INK,
-    RED,
+    NO_BREAK,
+    ORANGE,
     Canvas,
     judged,
     legend,
@@ -50,7 +51,7 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
     """Voltages, and the current if there is one: the whole record, and one pulse."""
     current = recording.samples.get("current")
     rows, share = (1, "none") if current is None else (2, "col")
-    axes = canvas(rows, 2, (9.0, 3.2 if rows == 1 else 4.8), sharex=share).reshape(rows, 2)
+    axes = canvas(rows, 2, (7.5, 3.0 if rows == 1 else 4.8), sharex=share).reshape(rows, 2)
     milliseconds = 1e3 * recording.time
     for column, part in enumerate((slice(None), pulse(recording))):
         time, axis = milliseconds[part], axes[0, column]
@@ -66,7 +67,7 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
             axes[1, column].plot(time, current.values[part] / size, color=INK, lw=0.9)
             axes[1, column].set(ylabel=heading("current", "ampere", largest))
         axes[-1, column].set(xlabel="time [ms]")
-    labels = [f"{name} {value}" for name in LABELS if (value := getattr(recording, name))]
+    labels = [f"{name}{NO_BREAK}{value}" for name in LABELS if (value := getattr(recording, name))]
     if recording.r_load is not None:
         labels.append(f"calibration with {recording.r_load / 1e3:g} kΩ")
     titled(axes[0, 0], [plain(recording.path), plain(", ".join(labels))], beside=True)
@@ -117,7 +118,7 @@ def _pulse_and_residual(
         without_elements(lower, "no elements, nothing predicted")
     else:
         predicted = predict(recording, driver, load)
-        upper.plot(time, predicted[part], "--", color=RED, lw=1.2, label="predicted")
+        upper.plot(time, predicted[part], "--", color=ORANGE, lw=1.2, label="predicted")
         sigma = 1e3 * residual_std(recording, driver, load)
         # Above 0.4 of the sample rate, aliases of the edges are neither noise nor predicted.
         label = r"$\pm2\,\sigma$ of the noise (edges: aliases)"

@@ -23,7 +23,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from etid.circuits.display import heading, rounded
 from etid.recordings.replacing import replacing
@@ -36,8 +36,9 @@ NO_BREAK = "\u00a0"
 EM = 0.55  # mean width of a character, relative to the size of the font
 INK = "#1a1a1a"
 BLUE = "#0b62a4"
-RED = "#c0392b"
-COLOURS = (BLUE, RED, "#2e7d32", INK)
+ORANGE = "#e07b00"
+RED = "#c0392b"  # of what has no success, and of nothing else
+COLOURS = (BLUE, ORANGE, "#2e7d32", INK)
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*")
 PAPER: Any = {
@@ -51,6 +52,7 @@ PAPER: Any = {
     "axes.axisbelow": True,
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "axes.formatter.useoffset": False,  # a tick of 185.82 is not 0.02 + 1.858e2
     "legend.frameon": False,
     "legend.fontsize": 8,
 }
@@ -94,6 +96,17 @@ class Canvas:
         if given.size != rows * columns:
             raise ValueError(f"axes holds {given.size} Axes; this picture takes {rows * columns}")
         return given.reshape(rows, columns)
+
+    def three(self, usual: tuple[float, float], *, wide: bool = False) -> np.ndarray:
+        """Three axes: the first beside the two others and as tall, or above them and as `wide`."""
+        if self.axes is not None or self.width < 2 * NARROW:
+            return self(1, 3, usual).ravel()
+        grid = self(2, 2, usual)
+        whole = grid[0, 0].get_gridspec()
+        grid[0, 0].set_subplotspec(whole[0, :] if wide else whole[:, 0])
+        spare = grid[0, 1] if wide else grid[1, 0]
+        spare.remove()
+        return np.array([axis for axis in grid.flat if axis is not spare])
 
 
 def new_figure(
@@ -202,7 +215,7 @@ def wrapped(text: str, inches: float, size: float) -> str:
 def without_elements(axis: Axes, text: str = "no elements") -> None:
     """Say in an empty panel why it is empty."""
     axis.text(0.5, 0.5, text, color=RED, transform=axis.transAxes, ha="center", va="center")
-    axis.set(yticks=[])
+    axis.set(xticks=[], yticks=[])
 
 
 def nth(looks: Sequence[Any], number: int) -> Any:
@@ -229,7 +242,9 @@ def plain_ticks(axis: Axis) -> None:
     """
     low, high = sorted(axis.get_view_interval())
     if 0 < low and high < 1e6 * low:
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
+        steps = LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,))
+        few = sum(low <= tick <= high for tick in steps.tick_values(low, high)) < 2
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]) if few else steps)
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
 
@@ -288,7 +303,7 @@ def judged(axis: Axes, path: str, found: Fit | Driver, *more: str) -> None:
     good = found.verdict == "successful"
     words = [found.verdict if good else f"no success: {found.verdict}"]
     if np.isfinite(chi2 := float(found.chi2)):
-        words.append(f"chi2 {rounded(chi2, 3)}")
+        words.append(f"χ² {rounded(chi2, 3)}")
     if np.isfinite(rrse := float(found.rrse)):
         words.append(f"RRSE {rounded(100 * rrse, 3)} %")
     words = [one.replace(" ", NO_BREAK) for one in words]

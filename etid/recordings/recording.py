@@ -9,6 +9,7 @@ NWB. So integer converter codes stay exact, and the size of a quantisation step 
 import abc
 import dataclasses
 import functools
+import importlib
 import inspect
 from collections.abc import Container, Hashable, Iterator, Mapping
 from types import MappingProxyType
@@ -263,6 +264,13 @@ class Recording(Overviewed, AbstractFields):
             )
             for number, part in enumerate(parts)
         ]
+
+    def plot(
+        self, *, axes: Any = None, size: tuple[float, float] | None = None, title: str | None = ""
+    ) -> np.ndarray:
+        """Draw the record; the same as `etid.plot(recording)`, with its arguments."""
+        drawn = importlib.import_module("etid.plotting")  # a higher layer
+        return drawn.plot(self, axes=axes, size=size, title=title)
 
     def __reduce__(self) -> tuple:
         # A read-only mapping cannot be pickled.

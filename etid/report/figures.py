@@ -45,7 +45,7 @@ SERIES = 4  # largest number of conditions in a figure
 def distributions(fits: Fits) -> bytes:
     """Distribution functions of the successful fits, for each element and condition."""
     good, units = fits.successful(), fits.circuit.units()
-    figure, axes = new_figure(1, len(units), (3.4 * len(units) + 1, 3.0), sharey=True)
+    figure, axes = new_figure(1, len(units), (2.6 * len(units) + 0.8, 3.0), sharey=True)
     for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
         for series, condition in enumerate(frequent(fits, SERIES)):
             values = _values(good.where(condition=condition), name, unit)
@@ -79,7 +79,7 @@ def _widen(axis: Axes, low: float, high: float) -> None:
 
 def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) -> bytes:
     """Histograms of χ² and of the largest relative standard error."""
-    figure, axes = new_figure(1, 2, (10.0, 2.6))
+    figure, axes = new_figure(1, 2, (8.0, 2.6))
     left, right = axes[0]
     left.axvline(1.0, color=INK, lw=1.0, ls=":")
     left.set(xlabel="χ² per degree of freedom", ylabel="fits")
@@ -107,7 +107,7 @@ def by_subject(fits: Fits) -> bytes:
     subjects, place = np.unique(good.labels["subject"].astype(str), return_inverse=True)
     named = subjects.size <= 30
     conditions = frequent(fits, SERIES)
-    width = min(14.0, max(10.0, 0.35 * subjects.size))
+    width = min(14.0, max(8.0, 0.35 * subjects.size))
     figure, axes = new_figure(len(units), 1, (width, 2.2 * len(units)), sharex=True)
     thin = 1.0 if subjects.size <= 60 else 0.5
     for axis, (name, unit) in zip(axes[:, 0], units.items(), strict=True):
@@ -123,7 +123,7 @@ def by_subject(fits: Fits) -> bytes:
             axis.vlines(where, quantiles[1], quantiles[3], color=colour, lw=2.6 * thin)
             axis.plot(
                 where, quantiles[2], MARKS[series], color=colour, ms=4.5 * thin,
-                markerfacecolor="white", label=plain(_short(condition)) or "all",
+                label=plain(_short(condition)) or "all",
             )  # fmt: skip
         axis.set(yscale="log", ylabel=symbol(name, unit))
         plain_ticks(axis.yaxis)
@@ -167,10 +167,10 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
     """Variations and errors of each element, side by side on one scale."""
     names = list(dict.fromkeys(one.name for one in found))
     parts = list(found[0].parts)
-    figure, axes = new_figure(1, len(names), (3.4 * len(names) + 1, 2.6), sharey=True)
+    figure, axes = new_figure(1, len(names), (2.4 * len(names) + 1.4, 2.6), sharey=True)
     for axis, name in zip(axes[0], names, strict=True):
         # Before the first point: an axis that has none would keep the limits of a linear one.
-        axis.set(xscale="log", xlabel=f"{symbol(name, '1')}: part of the median [%]")
+        axis.set(xscale="log", xlabel=f"{symbol(name, '1')} [% of the median]")
     for one in found:
         if one.condition not in conditions:
             continue

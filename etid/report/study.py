@@ -178,6 +178,7 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
         "the spread does not show it, and more trials do not reduce it. A cell is empty if the "
         "study cannot determine the number."
     )
+    text += _pooled(fits)
     conditions = len(set(map(str, fits.labels["condition"])))
     if conditions > study_tables.CONDITIONS:
         text += (
@@ -231,7 +232,13 @@ def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
         alt = "Each element of each fit by subject and condition, with standard errors."
         pictures = (Picture(caption, figures.each_fit(fits), alt, whole=True),)
     more, table = _grouped(fits, groups, ("subject", "condition"))
-    return Section("Subjects", text + more, (table,), pictures)
+    return Section("Subjects", text + _pooled(fits) + more, (table,), pictures)
+
+
+def _pooled(fits: Fits) -> str:
+    """A sentence on what a group of one subject in one condition holds together."""
+    names = [f"{name}s" for name in fits.pooled("subject", "condition")]
+    return f" Each subject's {' and '.join(names)} are pooled." if names else ""
 
 
 def _electrodes(fits: Fits, layout: Layout) -> list[Section]:

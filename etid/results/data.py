@@ -45,6 +45,11 @@ class MeasuredImpedance:
     z: Complex[np.ndarray, " frequency"]
     stderr: Float[np.ndarray, " frequency"] | None
 
+    def plot(self, *, axes: AnyAxes = None, size: Size = None, title: str | None = "") -> Any:
+        """Draw the points; the same as `etid.plot(spectrum)`, with its arguments."""
+        drawn = _of_higher_layer("etid.plotting", "plot")
+        return drawn(self, axes=axes, size=size, title=title)
+
 
 class HasSource(Generic[Circuit]):
     """A result that may know its recording and its driver, or its measured impedance.

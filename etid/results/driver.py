@@ -2,9 +2,10 @@
 
 import abc
 import dataclasses
+import importlib
 import os
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -161,6 +162,18 @@ class Driver(AbstractFeed):
                 "etid.identify_driver or etid.calibrate returns"
             )
         Study.from_recordings(self.recordings).write(path)
+
+    def plot(
+        self,
+        calibration: Recording | None = None,
+        *,
+        axes: Any = None,
+        size: tuple[float, float] | None = None,
+        title: str | None = "",
+    ) -> np.ndarray:
+        """Draw Z_th, or a pulse of a calibration; the same as `etid.plot(driver, calibration)`."""
+        drawn = importlib.import_module("etid.plotting")  # a higher layer
+        return drawn.plot(self, calibration, axes=axes, size=size, title=title)
 
     @program
     def gain(

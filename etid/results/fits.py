@@ -198,6 +198,21 @@ class Fits(Overviewed, Generic[Circuit]):
         """
         return _summary(self, by)
 
+    def pooled(self, *by: str) -> list[str]:
+        """Labels that differ between the fits of a group by other labels, such as `session`.
+
+        Args:
+            *by: Labels that define the groups.
+        """
+        groups = list(zip(*(self.labels[name].tolist() for name in by), strict=True))
+        several = len(set(groups))
+        return [
+            name
+            for name in LABELS
+            if name not in ("path", "trial", *by)
+            and len(set(zip(groups, self.labels[name].tolist(), strict=True))) > several
+        ]
+
     def _overview(self) -> Overview:
         rows, units = [], self.circuit.units()
         for group in self.summary("subject", "condition"):
@@ -211,11 +226,13 @@ class Fits(Overviewed, Generic[Circuit]):
             rows.append((where, f"{group['successful']}/{group['fits']}", *elements))
         title = f"{several(len(self), 'fit')} of {type(self.circuit).__name__}"
         medians = "Median of the successful fits ± median standard error of one fit."
+        names = [f"{name}s" for name in self.pooled("subject", "condition")]
+        pooled = [f"Each row pools {' and '.join(names)}."] if names else []
         return Overview(
             f"{title}: {counted(self.verdicts)}" if len(self) else title,
             rows,
             ("", "successful", *itertools.starmap(heading, units.items())),
-            [medians] if "successful" in self.counts() else [],
+            [medians, *pooled] if "successful" in self.counts() else [],
         )
 
     def as_table(self) -> tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]:
