@@ -1,6 +1,7 @@
 """Batches: chunks, lengths, rates and drivers mixed; every recording gets its own answer."""
 
 import dataclasses
+import pickle
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +12,10 @@ import pytest
 
 import etid
 from etid.identify import fitting
+from etid.identify.options import Options
 from etid.recordings.preflight import Inspected
+from etid.results.fit import Limited
+from etid.results.instrument import ERRORS
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 from tests.skins import DRY, off
@@ -239,3 +243,139 @@ def test_failures_survive_a_file_with_units_and_another_circuit_is_refused(mixed
         content.attrs["schema"] = "etid/recording"
     with pytest.raises(ValueError, match="is 'etid/recording', not 'etid/fits'"):
         etid.Fits.read(file)
+
+
+def test_a_fit_is_taken_by_the_path_of_its_recording(fits):
+    path = "s01/dry/3"
+    for found in (fits[path], fits[f"/{path}/"]):
+        assert float(found.circuit.r_p) == float(fits[3].circuit.r_p)
+    with pytest.raises(
+        KeyError, match=r"no fit 's01/dry/x'; this table has 18 fits, such as 's01/"
+    ):
+        fits["s01/dry/x"]
+    twice = etid.Fits.concatenate([fits.take(np.array([0, 3])), fits.take(np.array([3]))])
+    with pytest.raises(KeyError, match=r"2 fits have the path 's01/dry/3'; .*\[1, 2\]"):
+        twice[path]
+
+
+def test_one_fit_is_written_with_its_path_and_labels(study, driver, fits, tmp_path):
+    path = "s01/dry/3"
+    for one in (fits[path], etid.identify_skin(study[path], driver)):
+        one.write(tmp_path / "fit.h5")
+        again = etid.Fits.read(tmp_path / "fit.h5")
+        for name in ("path", "subject", "condition"):
+            assert again.labels[name].tolist() == [fits.labels[name][3]], name
+        assert float(again[path].circuit.r_p) == float(fits[path].circuit.r_p)
+    bare = dataclasses.replace(one)  # it knows no recording
+    bare.write(tmp_path / "fit.h5")
+    assert etid.Fits.read(tmp_path / "fit.h5").labels["path"].tolist() == [""]
+
+
+def test_fits_of_a_file_and_fresh_ones_are_one_table(fits, driver, tmp_path):
+    """A file keeps no support; bounds, changes and tolerances may be known of some only."""
+    part = fits.take(np.array([1]))
+    part.write(tmp_path / "fits.h5")
+    read = etid.Fits.read(tmp_path / "fits.h5")
+    nothing = {"change": None, "change_stderr": None}
+    bare = dataclasses.replace(part, fit=dataclasses.replace(part.fit, **nothing))
+    tolerances = np.ones((1, len(ERRORS), 3))
+    joint = dataclasses.replace(part, fit=dataclasses.replace(part.fit, by_tolerance=tolerances))
+    limits = Limited(np.zeros((1, 3)), np.full((1, 3), 1e6), np.zeros((1, 3)))
+    bounded = dataclasses.replace(part, fit=dataclasses.replace(part.fit, limits=limits))
+    for other in (part, bare, joint, bounded):
+        for parts in ([read, other], [other, read]):
+            both = etid.Fits.concatenate(parts)
+            assert both.counts() == {"successful": 2}
+            for row, one in enumerate(parts):
+                np.testing.assert_array_equal(both[row].cov, one[0].cov)
+                np.testing.assert_array_equal(both[row].known_changes[0], one[0].known_changes[0])
+                for name in ("limits", "support", "by_tolerance"):
+                    if (known := getattr(one[0], name)) is not None:
+                        found = jax.tree.leaves(getattr(both[row], name))
+                        np.testing.assert_equal(found, jax.tree.leaves(known))
+            assert "r_p" in str(both)
+            both.write(tmp_path / "both.h5")
+            assert len(etid.Fits.read(tmp_path / "both.h5")) == 2
+    other = dataclasses.replace(part, fit=dataclasses.replace(part.fit, circuit=etid.SkinCole()))
+    with pytest.raises(ValueError, match="etid:SkinCole and etid:SkinRC cannot be in one table"):
+        etid.Fits.concatenate([part, other])
+
+
+def test_results_of_the_parts_of_a_study_keep_the_failures_of_each(fits, driver):
+    """So do their drivers and fits; the settings are those of all parts."""
+    parts = [
+        etid.StudyFits(fits.take(np.array([row])), {(f"c{row}",): driver}, {(f"bad{row}",): why})
+        for row, why in enumerate(("too short", "flat", "saturated"))
+    ]
+    whole = etid.StudyFits.concatenate(parts)
+    assert whole.failures == {("bad0",): "too short", ("bad1",): "flat", ("bad2",): "saturated"}
+    assert list(whole.drivers) == [("c0",), ("c1",), ("c2",)]
+    assert whole.fits.labels["path"].tolist() == [f"s01/dry/{row}" for row in range(3)]
+
+
+@pytest.mark.parametrize(
+    "missing", [("plausible",), ("driver", "bounds", "recordings"), ("order",)]
+)
+def test_a_file_that_lacks_a_newer_setting_keeps_the_others(study, driver, fits, tmp_path, missing):
+    options = Options.of((etid.SkinRC(),), bounds={"r_s": (1e3, 1e6)})
+    settings = options.settings(study, len(fits))
+    found = etid.StudyFits(fits, {("calibration/0",): driver}, {}, settings)
+    found.write(tmp_path / "fits.h5")
+    assert etid.StudyFits.read(tmp_path / "fits.h5").settings == settings
+    with h5py.File(tmp_path / "fits.h5", "r+") as file:
+        for name in missing:
+            del file.attrs[name]
+    again = etid.StudyFits.read(tmp_path / "fits.h5").settings
+    empty = {"recordings": len(fits), "order": 0, "driver": ""}
+    expected = {name: empty.get(name, ()) for name in missing}
+    assert again == dataclasses.replace(settings, **expected)
+    fits.write(tmp_path / "fits.h5")
+    assert etid.StudyFits.read(tmp_path / "fits.h5").settings is None
+
+
+@pytest.fixture(scope="module")
+def conditions(tmp_path_factory):
+    """A file of two conditions, whose recordings name their calibration; one is damaged."""
+    trials = [
+        Trial(f"s01/{condition}/{i}", DRY, subject="s01", condition=condition)
+        for condition in ("dry", "damp")
+        for i in range(2)
+    ]
+    scene = Scene(tuple(trials), (Trial("calibration/0", ResistorLoad(98.8e3)),))
+    named = [
+        one.replace(calibration=("calibration/0",)) if one.r_load is None else one
+        for one in scene.simulate(seed=41).values()
+    ]
+    odd = named[1].replace(path="odd", condition="dry")
+    path = tmp_path_factory.mktemp("conditions") / "study.h5"
+    etid.Study.from_recordings([*named, odd]).write(path)
+    with h5py.File(path, "r+") as file:
+        file["odd/v_out"].attrs["unit"] = "furlong"
+    return path
+
+
+def copied(part):
+    return pickle.loads(pickle.dumps(part))
+
+
+@pytest.mark.parametrize("again", [lambda part: part, copied], ids=["itself", "pickle"])
+def test_a_part_of_a_study_finds_the_calibrations_that_it_names(conditions, again, tmp_path):
+    with etid.read(conditions) as study, again(study.where(condition="dry")) as dry:
+        assert list(study.problems) == ["odd"]
+        assert list(dry) == ["s01/dry/0", "s01/dry/1"]
+        assert dry.problems == {}  # it has no label: it is in no selection
+        found = etid.identify_study(dry)
+        assert found.fits.counts() == {"successful": 2}
+        assert list(found.drivers) == [("calibration/0",)]
+        dry.where(subject="s01").write(tmp_path / "dry.h5")
+        assert list(again(study.loaded).problems) == ["odd"]
+    with etid.read(tmp_path / "dry.h5") as alone:
+        assert list(alone) == ["calibration/0", "s01/dry/0", "s01/dry/1"]
+
+
+def test_a_part_in_memory_uses_the_only_calibration_of_the_whole(study):
+    part = copied(study.loaded)
+    assert len(part.calibrations) == 0
+    assert list(part.named.calibrations) == ["calibration/0"]
+    few = etid.Study.from_recordings([study["calibration/0"], study["s01/dry/2"]])
+    assert etid.identify_study(few.where(condition="dry")).fits.counts() == {"successful": 1}

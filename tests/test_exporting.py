@@ -21,6 +21,7 @@ import etid
 from etid import cli
 from etid.files import exporting
 from etid.recordings.recording import Samples
+from etid.results.fit import Limited
 from etid.results.fits import Fits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
@@ -124,6 +125,28 @@ def test_a_long_table_has_a_row_for_each_element(fits, parts, tmp_path, read):
     etid.export_fits(tmp_path / "fits.h5", target, long=True)
     left_out = {"change", "amplitude_change", "rrse", "chi2", "steps", "remarks"}
     assert set(found) - set(read(target, **options)) == left_out
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_a_table_of_all_columns_says_what_bounds_do(fits, parts, tmp_path, long):
+    """It has the columns of `Fits.table`, in their order."""
+    outside = np.zeros((COUNT, 3))
+    outside[2, 0] = -1.5
+    limits = Limited(np.full((COUNT, 3), 1e3), np.full((COUNT, 3), np.inf), outside)
+    bounded = dataclasses.replace(fits, fit=dataclasses.replace(fits.fit, limits=limits))
+    bounded.write(tmp_path / "fits.h5")
+    etid.export_fits(tmp_path / "fits.h5", tmp_path / "all.parquet", all=True, long=long)
+    found, table = parquet.read_table(tmp_path / "all.parquet"), bounded.table(long=long)
+    assert found.column_names == list(table)
+    for name, column in table.items():
+        np.testing.assert_array_equal(found[name].to_numpy(zero_copy_only=False), column, name)
+    said = [text for text in found["at_bound"].to_pylist() if text]
+    words = "Without bounds, r_s would be 1.5 standard errors below 1 kΩ."
+    assert said == [words] * (3 if long else 1)
+    etid.export_fits(tmp_path / "fits.h5", tmp_path / "few.parquet", long=long)
+    assert not {"at_bound", "outside"} & {
+        *parquet.read_table(tmp_path / "few.parquet").column_names
+    }
 
 
 def test_a_circuit_of_impedance_py_has_the_identified_values(fits, file, tmp_path):

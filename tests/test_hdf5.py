@@ -510,14 +510,14 @@ def test_a_file_that_cannot_be_written_is_an_error(name, tmp_path):
 
 
 def test_a_study_without_its_calibration_is_not_written(path, tmp_path):
-    with (
-        hdf5.read(path) as study,
-        pytest.raises(
-            RecordingError,
-            match="calibration: 'calibration/98k8' is not a calibration of the study",
-        ),
-    ):
+    """A part finds it in the whole; recordings alone do not."""
+    with hdf5.read(path) as study:
+        words = "calibration: 'calibration/98k8' is not a calibration of the study"
+        with pytest.raises(RecordingError, match=words):
+            Study.from_recordings(study.loaded.recordings()).write(tmp_path / "a.h5")
         study.loaded.write(tmp_path / "a.h5")
+        with hdf5.read(tmp_path / "a.h5") as again:
+            assert contents(again) == contents(study)
 
 
 def test_recordings_that_cannot_be_read_are_not_dropped_by_writing(edit, tmp_path):

@@ -21,9 +21,9 @@ from etid.recordings import limits
 from etid.recordings.errors import RecordingError, optional
 from etid.recordings.replacing import replace_text, replacing
 from etid.recordings.untrusted import attribute, translated
-from etid.results.fit import Fit
+from etid.results.fit import Fit, Limited
 from etid.results.fits import DESCRIBED, SCHEMA, VERSION, Fits
-from etid.results.fits_columns import long_form
+from etid.results.fits_columns import LIMITS, long_form
 from etid.results.hdf5_table import REMEDY, Table, check_same_length, opened_table
 
 ROWS = 1 << 16  # fits in memory at a time
@@ -69,12 +69,12 @@ def export_fits(
         columns = _columns(table, names)
         if not all:
             more = {f"{name}_change" for name in (*names, "amplitude")}
-            more |= {"rrse", "chi2", "steps", "remarks"}
+            more |= {"rrse", "chi2", "steps", "remarks", *LIMITS}
             columns = {name: column for name, column in columns.items() if name not in more}
         units = {name: _units(column, table) for name, column in columns.items()}
-        parts = _parts(table, columns)
+        of = {name: units[name] or "1" for name in names}
+        parts = _parts(table, columns, of)
         if long:
-            of = {name: units[name] or "1" for name in names}
             parts = (long_form(part, of) for part in parts)
         about = {name: table.text(name) for name in ("circuit", "method", "etid_version")}
         TABLES[suffix](parts, units, about, partial)
@@ -100,6 +100,8 @@ def _columns(table: Table, names: Sequence[str]) -> dict[str, h5py.Dataset]:
                "remarks": "text", "note": "text"}  # fmt: skip
     kinds = DESCRIBED | dict.fromkeys(elements, "number") | quality
     columns = {name: table.column(name, kind) for name, kind in kinds.items()}
+    if "outside" in table:  # only for fits with bounds
+        columns |= {name: table.column(name, "number", (len(names),)) for name in LIMITS}
     check_same_length(table, columns)
     return columns
 
@@ -113,11 +115,21 @@ def _units(column: h5py.Dataset, table: Table) -> str | None:
     return unit
 
 
-def _parts(table: Table, columns: dict[str, h5py.Dataset]) -> Iterator[dict[str, np.ndarray]]:
-    """The columns in parts of `ROWS` rows; one part without rows if there are no fits."""
+def _parts(
+    table: Table, columns: dict[str, h5py.Dataset], units: Mapping[str, str]
+) -> Iterator[dict[str, np.ndarray]]:
+    """The columns in parts of `ROWS` rows; one part without rows if there are no fits.
+
+    What the bounds do is a text, in place of the columns of the bounds.
+    """
     for start in range(0, max(1, len(columns["path"])), ROWS):
         rows = slice(start, start + ROWS)
-        yield {name: table.read(column, rows) for name, column in columns.items()}
+        part = {name: table.read(column, rows) for name, column in columns.items()}
+        if "outside" in part:
+            bounds = zip(*(part.pop(name) for name in LIMITS), strict=True)
+            part["at_bound"] = np.array([Limited(*of).text(units) for of in bounds], str)
+            part["note"] = part.pop("note")  # the last one
+        yield part
 
 
 _Part = dict[str, np.ndarray]

@@ -380,9 +380,9 @@ def identify_jointly(
 def _check_steady(study: Study, instrument: Instrument | None) -> None:
     """Raise ValueError if an instrument says that a driver drifts."""
     told = [instrument]
-    for path in study.calibrations if instrument is None else ():
+    for path in study.named.calibrations if instrument is None else ():
         with contextlib.suppress(RecordingError):  # costs the recordings of that driver alone
-            told.append(instrument_of([study.metadata(path)]))
+            told.append(instrument_of([study.named.metadata(path)]))
     if any("drift" in one.stored() for one in told if one is not None):
         raise ValueError(
             "a joint fit identifies each driver together with all its recordings, so that it has "

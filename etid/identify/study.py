@@ -127,7 +127,7 @@ class Drivers:
     def __init__(self, study: Study, options: Options) -> None:
         self.study = study
         self.options = options
-        self.calibrations = tuple(study.calibrations)
+        self.calibrations = tuple(study.calibrations) or tuple(study.named.calibrations)
         self.found: dict[tuple[str, ...], Driver] = {}
         self.failures: dict[tuple[str, ...], str] = {}
         self._one_at_a_time = threading.Lock()
@@ -190,7 +190,7 @@ class Drivers:
 
     def _identify(self, names: tuple[str, ...]) -> None:
         try:
-            records = [self.study[name] for name in names]
+            records = [self.study.named[name] for name in names]
             self.found[names] = calibrated(records, self.options, throw=False)
         except (IdentificationError, ValueError, KeyError) as error:
             self.failures[names] = str(error)

@@ -74,9 +74,11 @@ class Study(Overviewed, Mapping[str, Recording]):
         problems: Mapping[str, RecordingError] | None = None,
         file: str = "",
         close: Callable[[], None] | None = None,
+        named: "Study | None" = None,
     ) -> None:
         self._sources = dict(sources)
         self._close = close
+        self._named = named
         self.problems: dict[str, RecordingError] = dict(problems or {})
         self.file = file
 
@@ -218,24 +220,43 @@ class Study(Overviewed, Mapping[str, Recording]):
         """
         wanted = wanted_labels(labels, LABELS)
         return self._part(
-            lambda metadata: all(getattr(metadata, name) == label for name, label in wanted.items())
+            lambda metadata: all(
+                getattr(metadata, name) == label for name, label in wanted.items()
+            ),
+            {},  # a recording that cannot be read has no labels
         )
 
     @property
     def calibrations(self) -> "Study":
         """Study of the recordings with a known resistor."""
-        return self._part(lambda metadata: metadata.kind == "calibration")
+        return self._part(lambda metadata: metadata.kind == "calibration", self.problems)
 
     @property
     def loaded(self) -> "Study":
         """Study of the recordings with an unknown load."""
-        return self._part(lambda metadata: metadata.kind == "loaded")
+        return self._part(lambda metadata: metadata.kind == "loaded", self.problems)
 
-    def _part(self, belongs: Callable[[Metadata], bool]) -> "Study":
-        chosen = {
-            path: source for path, source in self._sources.items() if belongs(source.metadata)
-        }
-        return Study(chosen, problems=self.problems, file=self.file, close=self._close)
+    @property
+    def named(self) -> "Study":
+        """Study with the calibrations that its recordings name.
+
+        A part of a study, as `where` makes it, finds them in the whole.
+        """
+        return self if self._named is None else self._named
+
+    def _part(
+        self, belongs: Callable[[Metadata], bool], problems: Mapping[str, RecordingError]
+    ) -> "Study":
+        of = {"file": self.file, "close": self._close}
+        chosen, known = {}, {}
+        for path, source in self._sources.items():
+            metadata = source.metadata
+            if belongs(metadata):
+                chosen[path] = source
+            if metadata.kind == "calibration":
+                known[path] = source
+        named = self._named or Study(known, problems=self.problems, **of)
+        return Study(chosen, problems=problems, named=named, **of)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the study to an HDF5 file, completely or not at all.
@@ -243,7 +264,8 @@ class Study(Overviewed, Mapping[str, Recording]):
         Loaded recordings `g/0 … g/T-1` become one stacked group `g`, if there are at least two, if
         there are no other recordings below `g`, and if all fields except samples and trial are
         equal. If they share one `v_th`, it is stored once. Every other recording becomes a separate
-        group. `etid.read` gives the same paths, stored integers and metadata.
+        group. `etid.read` gives the same paths, stored integers and metadata. A part of a study is
+        written with the calibrations that its recordings name.
 
         Args:
             path: File to write. An existing file is replaced at the end.
@@ -260,12 +282,16 @@ class Study(Overviewed, Mapping[str, Recording]):
             )
         from etid.recordings.hdf5 import write  # it imports this module
 
-        write(self._sources, path)
+        names = {name for one in self._sources.values() for name in one.metadata.calibration}
+        known = {name: of for name, of in self.named._sources.items() if name in names}
+        write(known | self._sources, path)
 
     def __reduce__(self) -> tuple:
+        named = None if self._named is None else self._named._sources
         if not self.file:
-            return Study, (self._sources,)
-        return _opened, (os.path.abspath(self.file), tuple(self._sources))
+            return _in_memory_again, (self._sources, named)
+        paths = (None if of is None else tuple(of) for of in (self._sources, named))
+        return _opened, (os.path.abspath(self.file), *paths, tuple(self.problems))
 
     def close(self) -> None:
         """Close the file of the study; all parts of the study use the same file."""
@@ -320,10 +346,24 @@ def _trials(
     return found
 
 
-def _opened(file: str, paths: Iterable[str]) -> Study:
+def _in_memory_again(
+    sources: Mapping[str, AbstractSource], named: Mapping[str, AbstractSource] | None
+) -> Study:
+    """A copy or a pickle of a study in memory becomes this."""
+    return Study(sources, named=None if named is None else Study(named))
+
+
+def _opened(
+    file: str, paths: Iterable[str], named: Iterable[str] | None, problems: Collection[str]
+) -> Study:
     """The recordings of a file at these paths; a copy or a pickle of a study becomes this."""
     from etid.recordings.hdf5 import read  # it imports this module
 
     whole = read(file)
-    sources = {path: whole.source(path) for path in paths}
-    return Study(sources, problems=whole.problems, file=file, close=whole.close)
+
+    def of(paths: Iterable[str], problems: Mapping[str, RecordingError], **more: Any) -> Study:
+        sources = {path: whole.source(path) for path in paths}
+        return Study(sources, problems=problems, file=file, close=whole.close, **more)
+
+    own = {path: error for path, error in whole.problems.items() if path in problems}
+    return of(paths, own, named=None if named is None else of(named, whole.problems))

@@ -6,9 +6,10 @@ when they are called.
 
 import dataclasses
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
+import jax
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -65,6 +66,14 @@ class HasSource(Generic[Circuit]):
         """The recording; None if it is not known."""
         known = getattr(self, "_data", (None, None))[0]
         return known if isinstance(known, Recording) else None
+
+    @property
+    def described(self) -> Mapping[str, Any]:
+        """The path, the labels and the numbers that describe the recording, as far as known."""
+        known = getattr(self, "_data", (None, None))[0]
+        if isinstance(known, Recording):
+            return vars(known.metadata)
+        return known if isinstance(known, Mapping) else {}
 
     @property
     def measured(self) -> MeasuredImpedance | None:
@@ -184,9 +193,14 @@ class HasSource(Generic[Circuit]):
 
 
 def with_data(
-    result: _Kind, source: Recording | MeasuredImpedance, driver: Driver | None = None
+    result: _Kind,
+    source: Recording | MeasuredImpedance | Mapping[str, Any],
+    driver: Driver | None = None,
 ) -> _Kind:
-    """The same result, which knows its recording and its driver, or its measured impedance."""
-    known = dataclasses.replace(result)  # pyright: ignore[reportArgumentType]  # a module of equinox
+    """The same result, which knows its recording and its driver, or its measured impedance.
+
+    A result of a table knows what describes its recording.
+    """
+    known = jax.tree.map(lambda leaf: leaf, result)  # another object
     object.__setattr__(known, "_data", (source, driver))
     return known

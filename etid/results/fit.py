@@ -288,7 +288,7 @@ class Fit(Judged, HasSource[Circuit]):
         return {name: one if one.ndim else one.item() for name, one in arrays.items()}
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the fit to an HDF5 file, as `Fits` of one; `Fits.read` reads it.
+        """Write the fit and the labels of its recording to an HDF5 file; `Fits.read` reads it.
 
         Raises:
             ValueError: This is a batch.
@@ -298,7 +298,7 @@ class Fit(Judged, HasSource[Circuit]):
 
         self.refuse_batch()
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self)
-        Fits(batch, described([{}]), np.array([self.note])).write(path)
+        Fits(batch, described([self.described]), np.array([self.note])).write(path)
 
     def refuse_batch(self) -> None:
         """Raise ValueError if this is a batch."""

@@ -1,6 +1,7 @@
 """A table of many fits, its labels, its file, and medians, spreads and errors of its groups."""
 
 import dataclasses
+import difflib
 import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +17,8 @@ from etid.circuits.lookup import class_path
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.errors import install
 from etid.recordings.fields import DESCRIBING, Label, check_names, wanted_labels
-from etid.results.fit import Fit
+from etid.results.data import with_data
+from etid.results.fit import Fit, Support
 from etid.results.fits_columns import (
     DESCRIBED,
     LABELS,
@@ -27,6 +29,7 @@ from etid.results.fits_columns import (
     long_form,
 )
 from etid.results.hdf5_table import Table, opened_table, write_table
+from etid.results.instrument import ERRORS
 from etid.results.verdicts import counted, counts
 
 AND = " + "  # between the names of estimators
@@ -38,13 +41,42 @@ def joined(methods: Iterable[str]) -> str:
 
 
 def concatenated(fits: Sequence[Fit]) -> Fit:
-    """Fits of several parts; those that were refused have no χ², and their method was not used."""
+    """Fits of several parts; those that were refused have no χ², and their method was not used.
+
+    What some of them do not have, as those of a file, is NaN there.
+
+    Raises:
+        ValueError: Their circuits are not of one kind.
+    """
+    kinds = {type(one.circuit): class_path(type(one.circuit)) for one in fits}
+    if len(kinds) > 1:
+        raise ValueError(
+            f"fits of {' and '.join(sorted(kinds.values()))} cannot be in one table: make a table "
+            "for each circuit, or identify all recordings with one circuit"
+        )
     used = [one.method for one in fits if np.isfinite(one.chi2).any()]
     method = joined(used or [one.method for one in fits])
     parts = [dataclasses.replace(one, method=method) for one in fits]
-    if any(one.limits is not None for one in parts):
-        parts = [dataclasses.replace(one, limits=one.all_limits) for one in parts]
+    has = [name for name in OPTIONAL if any(getattr(one, name) is not None for one in parts)]
+    parts = [dataclasses.replace(one, **{of: _known(one, of) for of in has}) for one in parts]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+OPTIONAL = ("limits", "change", "change_stderr", "support", "by_tolerance")  # fields of a fit
+
+
+def _known(fit: Fit, name: str) -> Any:
+    """An optional field of fits; NaN, or limits that every value meets, if they do not have it."""
+    found, lanes, elements = getattr(fit, name), len(fit.rrse), len(fit.circuit.names())
+    if found is not None:
+        return found
+    nothing: dict[str, Any] = {
+        "limits": fit.all_limits,
+        **dict(zip(("change", "change_stderr"), fit.known_changes, strict=True)),
+        "support": Support.unknown(elements, lanes),
+        "by_tolerance": np.full((lanes, len(ERRORS), elements), np.nan),
+    }
+    return nothing[name]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -84,8 +116,34 @@ class Fits(Overviewed, Generic[Circuit]):
     def __len__(self) -> int:
         return len(self.notes)
 
-    def __getitem__(self, index: int) -> Fit[Circuit]:
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.fit)
+    def __getitem__(self, index: int | str) -> Fit[Circuit]:
+        """The fit of a row, or of the recording at a path.
+
+        Raises:
+            KeyError: No fit has this path, or several have it.
+        """
+        row = self._row(index) if isinstance(index, str) else index
+        found = jax.tree.map(lambda leaf: np.asarray(leaf)[row], self.fit)
+        if np.ndim(found.rrse):
+            return found
+        labels = {
+            name: np.asarray(self.labels[name])[row] for name in DESCRIBED if name in self.labels
+        }
+        return with_data(found, labels)
+
+    def _row(self, path: str) -> int:
+        """The row of a path."""
+        paths = [str(one) for one in self.labels["path"]]
+        rows = [row for row, one in enumerate(paths) if one.strip("/") == path.strip("/")]
+        if len(rows) == 1:
+            return rows[0]
+        if rows:
+            raise KeyError(f"{len(rows)} fits have the path {path!r}; take one by its row, {rows}")
+        near = difflib.get_close_matches(path, paths, n=3) or paths[:3]
+        raise KeyError(
+            f"no fit {path!r}; this table has {several(len(self), 'fit')}, such as "
+            f"{', '.join(map(repr, near))}"
+        )
 
     def take(self, index: np.ndarray) -> "Fits[Circuit]":
         """The fits selected by an array.

@@ -204,7 +204,7 @@ class StudyFits(Overviewed):
         with opened_table(path, SCHEMA, VERSION) as table:
             fits = Fits.of_table(table, circuit)
             lines = table.read(table.column("drivers", "text")) if "drivers" in table else ()
-            settings = _settings(table)
+            settings = _settings(table, len(fits))
         drivers: dict[tuple[str, ...], Driver] = {}
         failures: dict[tuple[str, ...], str] = {}
         for number, line in enumerate(lines):
@@ -224,12 +224,25 @@ class StudyFits(Overviewed):
         return cls(fits, drivers, failures, settings)
 
 
-def _settings(table: Table) -> Settings | None:
+def _settings(table: Table, recordings: int) -> Settings | None:
+    """The settings in a file; None if it has none.
+
+    One that the version of etid which wrote the file did not have is empty.
+
+    Args:
+        table: The file.
+        recordings: Number of its fits.
+    """
     kinds = {field.name: field.type for field in dataclasses.fields(Settings)}
-    if not table.attributes >= kinds.keys():
+    known = table.attributes & kinds.keys()
+    if not known:
         return None
     values: dict[str, Any] = {}
     for name, kind in kinds.items():
+        if name not in known:
+            empty: Any = typing.get_origin(kind) or kind
+            values[name] = recordings if name == "recordings" else empty()
+            continue
         value = table.attribute(name)
         several = typing.get_args(kind)  # only tuples; the file stores them as a list or one item
         items = value if several and isinstance(value, list) else [value]
