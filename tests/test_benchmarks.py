@@ -1,14 +1,17 @@
 """Each benchmark runs in short, writes its tables and pictures, and says what it was asked."""
 
 import csv
+import importlib
 import shlex
 import shutil
+import types
 
 import jax
 import numpy as np
 import pytest
 
 import etid
+from benchmarks import __main__ as entry
 from benchmarks import (
     amplitude_errors,
     amplitudes,
@@ -193,3 +196,24 @@ def test_all_peers_solve_the_same_problem():
     terms = np.asarray(load(jax.numpy.asarray(q)))[used]
     np.testing.assert_allclose(by.terms(q), terms, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(by.jacobian(q), slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+
+
+def test_a_benchmark_without_its_package_names_what_to_install(monkeypatch, capsys):
+    """As after `pip install .`, which brings no extra."""
+    usual = importlib.import_module
+
+    def without(name):
+        if name == "benchmarks.which":
+            raise ModuleNotFoundError("No module named 'adjustText'", name="adjustText")
+        return usual(name)
+
+    monkeypatch.setattr(entry, "importlib", types.SimpleNamespace(import_module=without))
+    says = "needs the package adjustText: pip install 'etid[bench]' (in a clone: '.[bench]')"
+    with pytest.raises(SystemExit) as caught:
+        asked(["which", "--output", "a.csv"])
+    assert caught.value.code == f"python -m benchmarks which {says}"
+    with pytest.raises(SystemExit) as caught:
+        asked(["--help"])
+    assert caught.value.code == 0
+    assert says in " ".join(capsys.readouterr().out.split())
+    assert asked(["noise"]).module is usual("benchmarks.noise")

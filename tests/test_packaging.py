@@ -7,10 +7,14 @@ import subprocess
 import sys
 import tomllib
 
+import h5py
 import pytest
 import yaml
 
 import etid
+from benchmarks import specimens
+from etid.report import methods
+from etid.results import study_fits
 
 ROOT = pathlib.Path(__file__).parents[1]
 # Keys of the Citation File Format 1.2.0, of which the first four are required.
@@ -127,3 +131,20 @@ assert not loaded, loaded
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_a_clone_that_is_not_installed_writes_its_version(tmp_path, monkeypatch):
+    """A folder on PYTHONPATH has no metadata; that must not end a fit after its work."""
+
+    def absent(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", absent)
+    study_fits.versions.cache_clear()
+    path = tmp_path / "fits.h5"
+    specimens.study_fits().write(path)
+    with h5py.File(path) as file:
+        assert file.attrs["etid_version"] == etid.__version__
+    assert study_fits.versions()[:2] == (f"etid {etid.__version__}", "jax of unknown version")
+    assert f"version = {{{etid.__version__}}}" in methods.bibtex(["etid"])
+    study_fits.versions.cache_clear()

@@ -1,9 +1,16 @@
 import pathlib
+import pkgutil
+import re
 import runpy
+import tomllib
 
 import numpy as np
 import pytest
 
+import etid
+from etid import cli
+from etid.commands import importing as importing_command
+from etid.files import formats, readers
 from etid.recordings import hdf5, schema
 
 FOLDER = pathlib.Path(__file__).parents[1] / "data_schema"
@@ -35,3 +42,32 @@ def test_texts_of_every_hdf5_kind_are_read_alike():
     field = schema.at("group attribute")["calibration"]
     for value in ("a", b"a", np.bytes_(b"a"), np.array(["a"], object), np.array([b"a"])):
         assert field.parse(value) == ("a",)
+
+
+def test_a_format_is_declared_once_and_everything_that_lists_formats_comes_from_there(tmp_path):
+    suffixes = [suffix for one in formats.FORMATS for suffix in one.suffixes]
+    assert len(suffixes) == len(set(suffixes))
+    page = (FOLDER / "README.md").read_text("utf-8")
+    told = importing_command.__doc__ or ""
+    for one in formats.FORMATS:
+        for suffix in one.suffixes:
+            assert f"`{suffix}`" in page.split("## Other formats")[1]
+            assert f"`{suffix}`" in (etid.import_file.__doc__ or "")
+            assert suffix in told
+            assert formats.format_of(tmp_path / f"a{suffix.upper()}") is one
+    with pytest.raises(etid.RecordingError, match=", ".join(map(re.escape, suffixes))):
+        formats.format_of(tmp_path / "a.asc")
+    modules = {one.name for one in pkgutil.iter_modules(readers.__path__)}
+    opened = {one.opened.__module__.rpartition(".")[2] for one in formats.FORMATS}
+    assert modules - opened == {"matlab_5"}  # the check of old MATLAB files
+
+
+def test_the_extra_of_a_format_exists():
+    project = tomllib.loads((FOLDER.parent / "pyproject.toml").read_text("utf-8"))["project"]
+    assert {*formats.EXTRAS} <= {*project["optional-dependencies"]}
+
+
+def test_the_help_of_the_command_lists_the_formats():
+    (commands,) = (one for one in cli.parser(["import"])._actions if one.dest == "command")
+    help_of = " ".join(commands.choices["import"].format_help().split())  # type: ignore[index,call-overload]
+    assert ", ".join(formats.SUFFIXES) in help_of

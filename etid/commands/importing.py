@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     folder = os.path.isdir(arguments.source[0]) and arguments.mapping is None
     if folder or arguments.labels:
         return _folder(arguments, given)
-    calibrations = resistors(arguments.calibrations)
+    calibrations = resistors((file, ohm) for file, ohm in arguments.calibrations)
     used = import_file(
         arguments.source,
         arguments.target,
