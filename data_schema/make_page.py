@@ -106,6 +106,7 @@ FORMATS
 
 A table contains its rate if a preamble of an oscilloscope has a `Sample Interval` or an
 `Increment`. In all formats a name such as `open [mV]`, `open (mV)` or `open / mV` contains a unit.
+Columns of one name tell their place: `CH1#2` and `CH1#4` are the second and the fourth column.
 
 The import keeps only a part of a record in memory. MATLAB files before version 7.3, `.npz` files
 and records that are split are the exceptions. Integer codes stay integers if a straight line
@@ -116,8 +117,9 @@ A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Key
 
 - `v_th`, `v_out`: unloaded output, and output with the load. Each is a table with these keys:
     - `channel`: its name in the file; `FILE:NAME` is channel `NAME` of another file, whose path
-      begins in the current folder. With a pattern such as `CH{electrode}` for `v_out`, each channel
-      that matches becomes the recording of an electrode, `path/1`, `path/2`, …;
+      begins in the folder that is imported, or in the current one. With a pattern such as
+      `CH{electrode}` for `v_out`, each channel that matches becomes the recording of an electrode,
+      `path/1`, `path/2`, …;
     - `unit` of its values: `V`, `A` or `s`, with the prefix `k`, `m`, `u` or `µ`, `n`, `p`, or in
       words; needed unless the file contains it;
     - `scale` of this channel alone;
@@ -141,7 +143,8 @@ A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Key
   `path/E7/0`, `path/E7/1`, ….
 - `path` of the recording in the etid file. Several trials become `path/0`, `path/1`, …. Without a
   path, a single `[[recording]]` becomes `loaded/0`, …, or with `r_load` `calibration/0`, ….
-- FIELDS: as in the tables above. `trial` may be a list with one label per trial. `calibration` may
+- FIELDS: as in the tables above. `r_load` may be
+  a text such as `"98k8"`. `trial` may be a list with one label per trial. `calibration` may
   name the `path` of a `[[recording]]` above it that becomes several calibrations: a recording gets
   that of its own electrode, or all if they are trials of one.
 

@@ -149,7 +149,7 @@ etid.identify_study(of.study, method='equation_error', instrument=GAIN) -> gives
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=-0.1)) -> r_load .* is \-0\.1; it
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=np.nan)) -> r_load .* is nan; it
 etid.identify_study(of.study, method='equation_error', fixed={'r_s': 1.0}) -> no known elements
-etid.identify_study(of.study, circuit='R0-p(R1') -> 'R0\-p\(R1' is no circuit: cannot read
+etid.identify_study(of.study, circuit='R0-p(R1') -> 'R0\-p\(R1' is no circuit: it ends too early
 etid.identify_skin(of.skin, circuit='R0-R0') -> has R0 twice
 etid.identify_skins([of.skin], circuit='SkinRC') -> circuit: is str 'SkinRC', must be
 etid.identify_impedance([1.0], [1j], circuit='auto') -> circuit: is str 'auto', must be
