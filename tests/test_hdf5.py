@@ -220,7 +220,7 @@ PROBLEMS = [
     (attribute(f"{DAMP}/v_th", "conversion", 0.0), "v_th.conversion: is 0"),
     (attribute(f"{DAMP}/v_th", "offset", np.inf), "v_th.offset: is inf"),
     (lambda file: file[DAMP].attrs.update(calibration=file["s01"].ref), "is an HDF5 reference"),
-    (attribute(DAMP, "Condition ", 1), "did you mean condition?. Rename it"),
+    (attribute(DAMP, "Condition ", 1), "did you mean condition? Rename it"),
     (misspell_offset, "v_th.ofset: is not in the schema, did you mean"),
     (make_sequence, "subject: cannot be read (it is a sequence of variable length)"),
     (put("curent", [1.0]), "curent: is not in the schema, did you mean current?"),

@@ -1,5 +1,6 @@
 """What `print`, `repr` and a notebook show: values, errors, units and verdicts, no arrays."""
 
+import copy
 import dataclasses
 import functools
 import re
@@ -13,7 +14,9 @@ import pytest
 import etid
 from etid.circuits.display import between, quantity
 from etid.circuits.overview import ROWS, Overview
+from etid.online.state import Change
 from etid.recordings.remarks import Remark
+from etid.results.data import MeasuredImpedance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
 from etid.results.fit import Support
 from etid.results.fits_columns import described
@@ -119,6 +122,15 @@ SHOWN = {
     "circuit": (lambda: DRY, ["SkinRC", "186 kΩ", "0.12 nF"]),
     "circuits": (lambda: fits().circuit, ["SkinRC", "186 … 186 kΩ"]),
     "stderr": (lambda: fit().stderr, ["SkinRC", "0.1 kΩ"]),
+    "scene": (
+        lambda: etid.scenes.paper_dry(),
+        ["1 calibration, 10 trials, 10000 samples", "typical/dry/10 SkinLoad"],
+    ),
+    "samples": (lambda: etid.Samples(np.zeros(4, "i2"), 0.5), ["Samples: 4 of int16"]),
+    "spectrum": (
+        lambda: MeasuredImpedance(np.array([60.0]), np.array([2e5 - 1e3j]), None),
+        ["Impedance at 1 frequency", "60 200 -1"],
+    ),
     "driver": (driver, ["Driver of order 3: successful", "|Z_th| at 1 kHz", "±", "kΩ"]),
     "study fits": (
         lambda: etid.StudyFits(fits(), {("a/b", "c"): driver()}, {("d",): "no signal"}),
@@ -143,6 +155,29 @@ def test_numbers_have_units_and_no_array_is_printed(make, texts):
         assert [text for text in texts if text not in shown] == []
         assert not ARRAYS.search(shown)
     assert str(one) == one._overview().text()
+
+
+def test_errors_and_derivatives_are_not_printed_as_a_circuit():
+    """A derivative had units such as pΩ and kF; standard errors had the formula of the circuit."""
+    errors = fit().stderr
+    assert str(errors).startswith("Standard errors of SkinRC\n")
+    assert str(copy.deepcopy(errors)) == str(errors)
+    assert str(jax.tree.map(np.asarray, DRY)).startswith("SkinRC: R_s")
+    derivative = DRY.with_values(np.array([2.0, 1.8, -1.6e14]))
+    assert str(derivative).splitlines() == [
+        "SkinRC: numbers by element in SI units, no circuit",
+        "  r_s         2",
+        "  r_p       1.8",
+        "  c_p  -1.6e+14",
+    ]
+
+
+def test_a_layout_and_a_change_are_a_sentence():
+    assert str(etid.Layout.grid(2, 3, 1e-3)) == "Layout of 6 electrodes, E1 … E6: 2 x 1 mm"
+    assert str(Change(7, 3, "jump", "c_p", 1.2345)) == (
+        "pulse 7, electrode 3: jump, c_p is 1.23 times what it was"
+    )
+    assert str(Change(7, None, "driver", "", np.nan)) == "pulse 7: the driver has changed"
 
 
 def test_several_circuits_say_how_many_and_one_does_not():

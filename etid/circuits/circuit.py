@@ -66,7 +66,13 @@ def _numbers(value: Any) -> Any:
     return numbers.astype(float) if numbers.dtype.kind in "biu" else numbers
 
 
-class AbstractCircuit(Overviewed, Module):
+class _Titled:
+    """A title in print; what JAX makes of a circuit has none."""
+
+    __slots__ = ("_title",)  # equinox would make an entry of `__dict__` part of the tree structure
+
+
+class AbstractCircuit(_Titled, Overviewed, Module):
     """A passive two-terminal circuit with positive parameters.
 
     Attributes:
@@ -145,6 +151,12 @@ class AbstractCircuit(Overviewed, Module):
         """Whether the impedance is a ratio of polynomials in s."""
         return self.impedance().is_rational
 
+    def titled(self: _Same, title: str) -> _Same:
+        """The same circuit; print shows this title above its elements."""
+        same = type(self)(**{name: getattr(self, name) for name in self.names()})
+        object.__setattr__(same, "_title", title)
+        return same
+
     def exponents(self) -> tuple[Quantity, ...]:
         """Exponents α of the powers of s in the impedance; empty for a ratio of polynomials."""
         return self.impedance().exponents() if _has_exponents(type(self)) else ()
@@ -170,8 +182,26 @@ class AbstractCircuit(Overviewed, Module):
     def _overview(self) -> Overview:
         kind, values = type(self).__name__, np.asarray(self.values())
         batch = f", batch of {values.shape[:-1]}" if values.ndim > 1 else ""
+        if title := getattr(self, "_title", ""):
+            return Overview(f"{title}{batch}", element_rows(self.units(), values))
+        if not self._may_be_one(values):
+            # Such as a derivative by the elements, which JAX returns in a circuit: it has no unit.
+            rows = [(n, *of) for n, *of in element_rows(dict.fromkeys(self.names(), "1"), values)]
+            return Overview(f"{kind}{batch}: numbers by element in SI units, no circuit", rows)
         formula = f": {self.formula}" if self.formula not in ("", kind) else ""
         return Overview(f"{kind}{batch}{formula}", element_rows(self.units(), values))
+
+    def _may_be_one(self, values: np.ndarray) -> bool:
+        """Whether elements are of a size that they can have: not negative, not 1e6 times another.
+
+        Elements that are not a finite number, or 0, are those of a fit that failed.
+        """
+        typical = np.asarray(type(self)().values())
+        size = np.abs(values / typical)
+        known = np.isfinite(values) & (size > 0)
+        return bool(np.all(values[np.isfinite(values)] >= 0)) and not np.any(
+            known & ((size > 1e6) | (size < 1e-6))
+        )
 
     def __repr__(self) -> str:
         try:

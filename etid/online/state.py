@@ -219,6 +219,12 @@ class Change:
     element: str
     factor: float
 
+    def __str__(self) -> str:
+        if self.electrode is None:
+            return f"pulse {self.pulse}: the driver has changed"
+        by = f"{self.element} is {rounded(self.factor, 3)} times what it was"
+        return f"pulse {self.pulse}, electrode {self.electrode}: {self.kind}, {by}"
+
 
 def changes(state: TrackerState, names: tuple[str, ...]) -> list[Change]:
     """The changes that the last pulse has shown; see `Tracker.changes`."""

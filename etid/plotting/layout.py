@@ -8,12 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from etid.circuits.display import several
+from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import RecordingError, located, optional, require_file
 from etid.recordings.tables import rows_of
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Layout:
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Layout(Overviewed):
     """Places of electrodes.
 
     Attributes:
@@ -39,6 +41,12 @@ class Layout:
             )
         for name, value in (("electrodes", tuple(names)), ("x", x), ("y", y)):
             object.__setattr__(self, name, value)
+
+    def _overview(self) -> Overview:
+        names = self.electrodes
+        ends = " … ".join(dict.fromkeys([*names[:1], *names[-1:]]))
+        size = " x ".join(f"{1e3 * np.ptp(of) if of.size else 0.0:g}" for of in (self.x, self.y))
+        return Overview(f"Layout of {several(len(names), 'electrode')}, {ends}: {size} mm")
 
     @classmethod
     def grid(cls, rows: int, columns: int, pitch: float, first: str = "E1") -> "Layout":

@@ -35,7 +35,7 @@ class RecordingError(ValueError):
             part for part in (self.file, repr(self.path) if self.path else "", self.field) if part
         )
         text = f"{place}: {self.message}" if place else self.message
-        return f"{text}. {self.remedy}." if self.remedy else f"{text}."
+        return " ".join(map(_ended, filter(None, (text, self.remedy))))
 
     def located(self, *, file: str = "", path: str = "", field: str = "") -> "RecordingError":
         """The same error; parts of its place that are empty are filled in."""
@@ -46,6 +46,11 @@ class RecordingError(ValueError):
             field=self.field or field,
             remedy=self.remedy,
         )
+
+
+def _ended(text: str) -> str:
+    """A sentence with its mark at the end; a question has its own."""
+    return text if text.endswith("?") else f"{text}."
 
 
 def require_file(path: str) -> None:

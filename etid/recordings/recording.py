@@ -41,8 +41,8 @@ from etid.signals.pulse_train import find_pulses
 quietly = functools.partial(np.errstate, invalid="ignore", over="ignore")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Samples:
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Samples(Overviewed):
     """One record as the instrument stored it.
 
     value = conversion · stored + offset                    (NWB, TimeSeries)
@@ -109,6 +109,11 @@ class Samples:
         """
         step = 1.0 if self.stored.dtype.kind in "iu" else printed_step(self.stored)
         return abs(self.conversion) * step or None
+
+    def _overview(self) -> Overview:
+        shape = " x ".join(map(str, self.stored.shape))
+        rows = [("conversion", f"{self.conversion:g}"), ("offset", f"{self.offset:g}")]
+        return Overview(f"Samples: {shape} of {self.stored.dtype}", rows)
 
     def __reduce__(self) -> tuple:
         # By default a copy would hold an array that can be written.

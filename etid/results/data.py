@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import Circuit
+from etid.circuits.display import rounded, several
+from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.instrument import Budget
@@ -32,8 +34,8 @@ def _of_higher_layer(module: str, name: str) -> Callable[..., Any]:
     return getattr(importlib.import_module(module), name)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MeasuredImpedance:
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class MeasuredImpedance(Overviewed):
     """An impedance as an instrument measured it.
 
     Attributes:
@@ -45,6 +47,17 @@ class MeasuredImpedance:
     frequency: Float[np.ndarray, " frequency"]
     z: Complex[np.ndarray, " frequency"]
     stderr: Float[np.ndarray, " frequency"] | None
+
+    def _overview(self) -> Overview:
+        errors = [""] * self.z.size
+        if self.stderr is not None:
+            errors = [f"± {rounded(one / 1e3)}" for one in self.stderr]
+        rows = [
+            (rounded(f, 4), f"{z.real / 1e3:.5g}", f"{z.imag / 1e3:.5g}", error)
+            for f, z, error in zip(self.frequency, self.z, errors, strict=True)
+        ]
+        heads = ("frequency [Hz]", "Re Z [kΩ]", "Im Z [kΩ]", "of each part")
+        return Overview(f"Impedance at {several(self.z.size, 'frequency')}", rows, heads)
 
     def plot(self, *, axes: AnyAxes = None, size: Size = None, title: str | None = "") -> Any:
         """Draw the points; the same as `etid.plot(spectrum)`, with its arguments."""

@@ -226,7 +226,8 @@ class Fit(Judged, HasSource[Circuit]):
         variance = xp.diagonal(cov, axis1=-2, axis2=-1)
         values = xp.sqrt(xp.where(variance >= 0, variance, xp.nan))
         values = xp.moveaxis(values, -1, 0)
-        return type(self.circuit)(**dict(zip(self.circuit.names(), values, strict=True)))
+        errors = type(self.circuit)(**dict(zip(self.circuit.names(), values, strict=True)))
+        return errors.titled(f"Standard errors of {type(errors).__name__}")
 
     @property
     @np.errstate(all="ignore")  # a fit that failed may hold any number

@@ -30,6 +30,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import several
+from etid.circuits.overview import Overview, Overviewed
 from etid.precision import in_float64
 from etid.recordings.fields import LABELS, tidy_path
 from etid.recordings.recording import Recording, Samples
@@ -96,8 +98,8 @@ class Waveform:
     sigma: float
 
 
-@dataclasses.dataclass(frozen=True)
-class Scene:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Scene(Overviewed):
     """A set of recordings with one driver.
 
     Args:
@@ -141,6 +143,19 @@ class Scene:
     full_scale: float = 10.0
     bits: int | None = 16
     scale: float = 0.0535
+
+    def _overview(self) -> Overview:
+        labels = ("subject", "session", "site", "condition", "electrode", "trial")
+        every = self.calibration + self.trials
+        known = [name for name in labels if any(getattr(one, name) for one in every)]
+        rows = [(one.path, str(one.load), *(getattr(one, name) for name in known)) for one in every]
+        noise = "no noise" if self.snr_db is None else f"noise at {self.snr_db:g} dB"
+        title = (
+            f"Scene: {several(len(self.calibration), 'calibration')}, "
+            f"{several(len(self.trials), 'trial')}, {several(self.samples, 'sample')} at "
+            f"{self.sample_rate:g} Hz, pulses at {self.pulse_rate:g} Hz, {noise}"
+        )
+        return Overview(title, rows, ("path", "load", *known))
 
     def __post_init__(self) -> None:
         counts = collections.Counter(trial.path for trial in self.calibration + self.trials)
