@@ -7,8 +7,9 @@ changes all parts of the driver, independently. Printed is the coverage (with th
 
 With `--fault N` one kind at a time is exactly N tolerances wrong, up or down; only the record of
 the skin is late then. Printed is the part of the fits that report anything, beside that of the best
-test behind the usual driver (`benchmarks.visibility`). Left out are a wrong resistor, which is
-invisible, and a drift, which is not one error.
+test behind the usual driver (`benchmarks.visibility`), and the part that is silent: `successful`
+and wrong by more than `SILENT` of its standard errors. Left out are a wrong resistor, which is
+invisible, a capacitance across it, of which little is visible, and a drift, which is not one error.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from benchmarks.ladder import LOADS, TRUTH
 from benchmarks.rates import rate
 from benchmarks.runner import WORKERS, Target, each, option, report
 
+SILENT = 4.0  # standard errors
 FIRST = 5000  # number of the first driver
 SIZES = {  # [relative, F, s]
     "gain": 2e-3,
@@ -34,6 +36,7 @@ SIZES = {  # [relative, F, s]
     "capacitance": 2e-12,
     "drift": 5e-3,
     "delay": 5e-9,
+    "c_load": 1e-12,
 }
 KINDS = {**{name: (name,) for name in SIZES}, "all": tuple(SIZES)}
 MODES = ("behind a driver", JOINT)
@@ -75,6 +78,7 @@ def study(
     of = lab.all_records(lab.out(gain=1 + error["gain"]))(of)
     of = lab.all_records(lab.crosstalk(0.0, error["crosstalk"]))(of)
     of = lab.trials(lab.shunted(error["capacitance"]))(of)
+    of = lab.calibrations(lab.shunted(error["c_load"]))(of)
     of = lab.calibrations(lab.record(r_load=lab.REFERENCE / (1 + error["r_load"])))(of)
     if "drift" in names:  # of all parts, independently
         later = lab.drawn_driver(FIRST + number, SIZES["drift"], of.trials[0].out.driver)
@@ -116,7 +120,9 @@ def answers(
 def found(name: str, of: Draws, best: float) -> Target:
     """The part of the fits that report anything, which is to be as large as that of the best."""
     told = rate(of.verdicts != "successful", range(of.verdicts.size))
-    text = f"{told}, best test {best:.0%}"
+    wrong = (np.abs(of.error / of.stderr) > SILENT).any(axis=1)
+    silent = rate(wrong & (of.verdicts == "successful"), range(of.verdicts.size))
+    text = f"{told}, best test {best:.0%}; silent {silent}"
     return Target(f"{name}: found", told.rate, best, text=text, interval=(told.low, told.high))
 
 

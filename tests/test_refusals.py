@@ -69,6 +69,7 @@ of.impedance.plot(show='residual') -> no residual in time
 etid.Instrument(gain=-1e-3) -> gain
 etid.Instrument(capacitance=5.0) -> \[F\]
 etid.Instrument(r_load=5.0) -> relative
+etid.Instrument(c_load=5.0) -> \[F\]
 etid.identify_driver(of.calibration, instrument=GAIN, method='output_error') -> output_error
 etid.identify_skin(of.skin, of.tolerant, method='output_error') -> output_error
 etid.identify_driver(of.calibration, method='steiglitz_mcbride(steps=3)') -> has no such options

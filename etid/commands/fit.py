@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME=VALUE",
         help="standard deviation of an error of the instrument: gain, r_load, crosstalk or drift "
-        "[relative], capacitance [F] or delay [s], such as gain=1e-3; may be repeated",
+        "[relative], c_load or capacitance [F], delay [s], such as gain=1e-3; may be repeated",
     )
     parser.add_argument(
         "--plausible",

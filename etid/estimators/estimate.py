@@ -15,7 +15,7 @@ from etid.numpy_tier.tiers import program
 from etid.precision import Module
 from etid.results.driver import SourceImpedance
 from etid.results.fit import Support
-from etid.results.instrument import Instrument
+from etid.results.instrument import Effects, Instrument
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 MAX_STEPS = 500
@@ -50,6 +50,7 @@ class Estimate(Module):
             a fit of several amplitudes tests for it.
         doubtful: Whether another gain is likely; `cov` contains its effect.
         support: How well the data support this circuit; None if the estimator does not compute it.
+        by_tolerance: What errors of the instrument do to the parameters; None in the same case.
     """
 
     _: dataclasses.KW_ONLY
@@ -68,6 +69,7 @@ class Estimate(Module):
     late: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     doubtful: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     support: Support | None = None
+    by_tolerance: Effects | None = None
 
 
 class Prior(Module):

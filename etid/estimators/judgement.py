@@ -19,6 +19,7 @@ from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Support
+from etid.results.instrument import Effects
 from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.solvers.levenberg_marquardt import NormalEquations
 from etid.solvers.matrices import inverse
@@ -118,6 +119,7 @@ def judged(
         remarks=remarks(estimate) + at_bound,
         support=support or Support.unknown(values.size),
         limits=limited(circuit, own, outside),
+        by_tolerance=estimate.by_tolerance or Effects.unknown(values.size),
     )
 
 
@@ -138,7 +140,7 @@ def ordered(
     if not exchangeable(type(circuit)):
         return estimate
     places = places_of(estimate, circuit, bounds, prior)
-    support = estimate.support
+    support, effects = estimate.support, estimate.by_tolerance
     if support is not None:
         support = dataclasses.replace(support, spread_slope=support.spread_slope[places])
     return dataclasses.replace(
@@ -147,6 +149,7 @@ def ordered(
         cov=estimate.cov[places][:, places],
         shared_cov=estimate.shared_cov[places][:, places],
         support=support,
+        by_tolerance=effects and effects.of_elements(places),
     )
 
 

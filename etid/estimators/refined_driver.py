@@ -75,7 +75,7 @@ def from_harmonics(
     statistic = jnp.nanmax(of_calibrations.missing_pole(calibrations, near, linear))
     if r_load.size > 1:
         off = of_calibrations.mismatch(calibrations, near, linear)
-        calibration = dataclasses.replace(calibration, mismatch=off)
+        calibration = dataclasses.replace(calibration, mismatch=off.off, across=off.across)
     terms = 2 * jnp.sum(spectra.selected, dtype=rate.dtype)
     passive = _is_passive(source, estimate.cov, rate)
     return HarmonicDriver(
@@ -83,7 +83,7 @@ def from_harmonics(
         source=source,
         calibration=calibration,
         result=first_verdict(
-            *_faults(estimate, calibration, passive, terms),
+            *_faults(estimate, calibration, passive, terms, statistic),
             (statistic > of_calibrations.MISSING_POLE, RESULTS.order_too_low),
         ),
         method=method,
@@ -181,12 +181,16 @@ def _faults(
     calibration: Calibration,
     passive: Bool[Array, ""],
     terms: Float[Array, ""],
+    missing_pole: Float[Array, ""] | None = None,
 ) -> list[tuple[Bool[Array, ""], RESULTS]]:
     """What is wrong with a driver, the worst first."""
     settled = estimate.result == optx.RESULTS.successful
     wrong = jnp.array(False)
     if calibration.mismatch is not None:
         wrong = of_calibrations.disagree(calibration.mismatch, estimate.chi2, terms)
+    if calibration.across is not None and missing_pole is not None:
+        of = calibration.across, estimate.chi2, terms
+        wrong |= of_calibrations.bridged(*of, missing_pole)
     return [
         (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
         (wrong, RESULTS.resistors_disagree),

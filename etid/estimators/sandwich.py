@@ -102,6 +102,11 @@ class Linear(eqx.Module):
         others = self.told(rows) @ (self.bread() if covariance is None else covariance)
         return rows - others @ self.jacobian, others
 
+    def first(self, count: int) -> "Linear":
+        """The terms with the first parameters alone; the others are known."""
+        priors = None if self.priors is None else self.priors[:count]
+        return dataclasses.replace(self, jacobian=self.jacobian[:count], priors=priors)
+
     def along(self, directions: Float[Array, "q z"]) -> "Linear":
         """The terms with coordinates along these directions as parameters."""
         priors = None if self.priors is None else directions.T @ self.priors

@@ -72,7 +72,7 @@ from etid.recordings.study import Study
 from etid.results.driver import HarmonicDriver, Order
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
-from etid.results.instrument import ERRORS, Instrument, by_tolerance
+from etid.results.instrument import LATER, Effects, Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.results.verdicts import RESULTS, verdict, verdicts_of
 from etid.selection.delays import upper_limit
@@ -146,11 +146,15 @@ def _together(
 
     def fit(found: Found) -> Fit:
         of_model = METHOD, model.bounds, model.prior
-        fit = judgement.judged(found.estimate, model.circuit, driver.result, *of_model)
-        if driver.instrument is not None:
-            places = judgement.places_of(found.estimate, model.circuit, model.bounds, model.prior)
-            by_error = found.by_error[places]
-            fit = dataclasses.replace(fit, by_tolerance=by_tolerance(by_error.T))
+        estimate, told, of = found.estimate, driver.instrument, model.calibrations
+        if told is not None:
+            # The search has the errors that nobody stated with a size that no recording changes.
+            sizes = told.complete().deviations(of.calibration.r_load.size) / of.tolerances
+            moved = found.by_error.T * sizes[:, None]
+            later = jnp.full((len(LATER), moved.shape[-1]), jnp.nan)  # nothing changes between them
+            effects = Effects.of_errors(moved, told, later)
+            estimate = dataclasses.replace(estimate, by_tolerance=effects)
+        fit = judgement.judged(estimate, model.circuit, driver.result, *of_model)
         fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)
         return judgement.unless(fit, found.other, RESULTS.misfit)
 
@@ -365,12 +369,6 @@ def identify_jointly(
         found, drivers.found[names] = _fit_together(only, together)
         for group, judged in zip(together, found, strict=True):
             keep(group.rows, judged, drivers.found[names])
-    of_drivers = [of for of in drivers.found.values() if isinstance(of, HarmonicDriver)]
-    if any(of.instrument is not None for of in of_drivers):
-        none = np.full((len(ERRORS), len(only.circuit.names())), np.nan)
-        for row, fit in fits.items():  # of a fit that failed, or that no driver is needed for
-            if fit.by_tolerance is None:
-                fits[row] = dataclasses.replace(fit, by_tolerance=none)
     ordered = stacked([fits[row] for row in range(len(paths))])
     outcome = table([fields_of(study, path) for path in paths], ordered, notes)
     settings = options.settings(study, len(paths), METHOD)

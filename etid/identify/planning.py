@@ -29,6 +29,7 @@ from etid.recordings.preflight import Group, Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit, IdentificationError, Support
+from etid.results.instrument import Effects
 from etid.results.verdicts import message, verdict
 
 TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB
@@ -241,5 +242,6 @@ def failed_fit(name: str, options: Options, method: str) -> Fit:
         change_stderr=none.stderr,
         support=Support.unknown(size),
         limits=limited(circuit, of_circuit(options.bounds, circuit)),
+        by_tolerance=Effects.unknown(size),
     )
     return jax.tree.map(np.asarray, fit)

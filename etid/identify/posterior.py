@@ -33,7 +33,6 @@ from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_limits import Limits, of_circuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
-from etid.estimators.maximum_likelihood import load_fit
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
@@ -49,7 +48,7 @@ from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
-from etid.results.instrument import BUDGETED, ERRORS, NARROW, Budget, Instrument, by_tolerance
+from etid.results.instrument import BUDGETED, Budget, Effects
 from etid.results.posterior import Posterior
 from etid.solvers.importance_sampling import drawn
 from etid.solvers.matrices import inverse, is_definite
@@ -310,52 +309,18 @@ def _undetermined(fit: Fit) -> ValueError:
     return ValueError(f"the recording does not determine all elements of {fit}")
 
 
-@program
-def _effects(
-    lane: Harmonics, known: Known, circuit: AbstractCircuit, driver: HarmonicDriver
-) -> Float[Array, "tolerance element"]:
-    """Changes of the logarithms of the elements by `BUDGETED`, whose priors are standard normal.
-
-    It is the column of z in H⁻¹ (`etid.estimators.sandwich`).
-    """
-    load = terms_of(lane, known, circuit)
-    gains = load.gains
-    start = [circuit.log_values(), jnp.zeros(gains.outputs), known.driver.mean]
-    found = least(load, jnp.concatenate(start))[1]
-    by_z = load_fit.covariance_of_priors(load, found)[gains.owned :, : gains.elements]
-    assert driver.instrument is not None
-    errors = len(by_z) - driver.instrument.deviations(driver.calibration.r_load.size).size
-    later = by_z[errors - len(driver.cov) : errors]
-    drift = jnp.sqrt(jnp.sum(later**2, axis=0))
-    return jnp.concatenate([by_tolerance(by_z[errors:]), drift[None]])
-
-
 @in_float64
 def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budget:
     """`Fit.budget`."""
-    recording, driver = fit.source_or_own(recording, driver)
-    if not isinstance(driver, HarmonicDriver):
-        raise ValueError(
-            "a budget needs the driver of the fit, with the harmonics of its calibrations; "
-            "identify it by maximum likelihood, and pass it as in fit.budget(recording, driver)"
-        )
-    told = driver.instrument or Instrument()
-    stated = told.stored()
-    if fit.by_tolerance is not None:
-        sizes, effects = ERRORS, fit.by_tolerance
-    elif fit.method == "joint":
-        raise ValueError(
-            "this joint fit has no budget: pass instrument=etid.Instrument() to identify_jointly, "
-            "with the tolerances that you know; files of fits keep none"
-        )
-    else:
-        driver = dataclasses.replace(driver, instrument=told.narrow())
-        lane, known, _ = given(fit, recording, driver)
-        sizes, effects = BUDGETED, _effects(lane, known, fit.circuit, driver)
-    of = dict(zip(sizes, np.asarray(effects), strict=True))
+    effects = fit.by_tolerance
+    if effects is None or not np.isfinite(effects.moved).any():
+        effects = _effects(fit, *fit.source_or_own(recording, driver))
+    stated = dict(zip(BUDGETED, np.asarray(effects.stated).tolist(), strict=True))
+    moved = zip(BUDGETED, np.asarray(effects.moved), strict=True)
+    of = {name: part for name, part in moved if np.isfinite(part).all()}
     values = np.asarray(fit.circuit.values())
     cov, shared = (np.diagonal(np.asarray(of)) / values**2 for of in (fit.cov, fit.shared_cov))
-    instrument = {name: of[name] for name in stated if name in of}
+    instrument = {name: part for name, part in of.items() if stated[name]}
     rest = shared - sum(part**2 for part in instrument.values())
     return Budget(
         names=fit.circuit.names(),
@@ -365,5 +330,24 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
             **instrument,
         },
         tolerances=stated,
-        unstated={name: part / NARROW for name, part in of.items() if name not in stated},
+        unstated=effects.unstated,
     )
+
+
+def _effects(fit: Fit, recording: Recording | None, driver: Driver | None) -> Effects:
+    """The effects of errors of the instrument on a fit of a file, from its recording."""
+    if fit.method == "joint":
+        raise ValueError(
+            "this joint fit has no budget: pass instrument=etid.Instrument() to identify_jointly, "
+            "with the tolerances that you know; files of fits keep none"
+        )
+    if not isinstance(driver, HarmonicDriver):
+        raise ValueError(
+            "a budget needs the driver of the fit, with the harmonics of its calibrations; "
+            "identify it by maximum likelihood, and pass it as in fit.budget(recording, driver)"
+        )
+    lane, known, _ = given(fit, recording, driver)
+    estimator = named(fit.method)
+    found = jax.device_get(skin(lane, driver, known.driver, fit.circuit, estimator))
+    assert found.by_tolerance is not None
+    return found.by_tolerance

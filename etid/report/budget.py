@@ -42,6 +42,7 @@ def budgets(found: StudyFits, study: Study | None) -> list[Section]:
         "What stands behind “if” was not stated: such an error of the instrument would change the "
         "elements by this size, and is in no standard error."
     )
+    text = " ".join(filter(None, [text, budget.largest]))
     rows_shown = tuple(map(tuple, budget._overview().rows))
     return [
         Section("Budget", text, (Table(("source", *map(as_symbol, budget.names)), rows_shown),))

@@ -89,12 +89,18 @@ class Calibration(Overviewed, Module):
         mismatch: Difference between the logarithm of each known resistor and its value from the
             other calibrations, and the standard error of this difference. None for one
             calibration, or if not known.
+        across: Capacitance across each known resistor that the other calibrations do not show, and
+            its standard error [F]; None in the same cases, and by output error.
+        errors: Errors of the instrument that several calibrations show [standard deviations that an
+            `Instrument` states]; None if they are 0.
     """
 
     r_load: Float[Array, " record"]
     delay_samples: Float[Array, " record"]
     delay_std_samples: Float[Array, ""]
     mismatch: Float[Array, "2 record"] | None = None
+    across: Float[Array, "2 record"] | None = None
+    errors: Float[Array, " error"] | None = None
 
     def _overview(self) -> Overview:
         open_delay = float(self.delay_std_samples)
@@ -306,13 +312,17 @@ class ContinuousDriver(Driver):
         drift = None if self.instrument is None else self.instrument.drift
         return np.asarray(drift) if isinstance(drift, int | float) else drift
 
-    def drift_std(self) -> Float[Array, " parameter"]:
-        """Standard deviations of the parameters of `source` that come from `drift` alone."""
+    def drift_std(self, drift: float | None = None) -> Float[Array, " parameter"]:
+        """Standard deviations of the parameters of `source` that come from a drift alone.
+
+        It is that of the driver if it is not given.
+        """
         # Frequencies, dampings and R are stored as logarithms, so their changes are relative.
         relative = jax.tree.map(jnp.ones_like, self.source)
         gains = (self.source.gain, self.source.slope, self.source.gain_real)
         relative = eqx.tree_at(lambda s: (s.gain, s.slope, s.gain_real), relative, gains)
-        return jnp.abs(ravel_pytree(relative)[0]) * (0.0 if self.drift is None else self.drift)
+        own = 0.0 if self.drift is None else self.drift
+        return jnp.abs(ravel_pytree(relative)[0]) * (own if drift is None else drift)
 
     def later_cov(self) -> Float[Array, "parameter parameter"]:
         """Covariance of the parameters of `source` at the time when a skin is recorded."""
@@ -360,10 +370,16 @@ class ContinuousDriver(Driver):
         known = self.calibration
         if known.mismatch is None:
             return []
+        across: list[str] = [""] * known.r_load.size
+        if known.across is not None:
+            across = [
+                f", with {' '.join(plus_minus(1e12 * c, 1e12 * error).split())} pF across it"
+                for c, error in np.asarray(known.across).T.tolist()
+            ]
         return [
             f"r_load {float(r) / 1e3:.6g} kΩ is {100 * float(np.expm1(off)):+.3g}"
-            f" ± {per_cent(float(error))} off what the others say"
-            for r, off, error in zip(known.r_load, *known.mismatch, strict=True)
+            f" ± {per_cent(float(error))} off what the others say{of_c}"
+            for r, off, error, of_c in zip(known.r_load, *known.mismatch, across, strict=True)
         ]
 
 

@@ -19,6 +19,7 @@ from etid.circuits.overview import Overview, element_rows
 from etid.precision import Module
 from etid.recordings.remarks import texts, words
 from etid.results.data import HasSource
+from etid.results.instrument import Effects, largest
 from etid.results.method_options import without_known
 from etid.results.posterior import tails
 from etid.results.verdicts import RESULTS, Judged, counted, message
@@ -198,8 +199,8 @@ class Fit(Judged, HasSource[Circuit]):
         support: How well the data support this circuit, for the choice between circuits; NaN or
             None if the method computes no likelihood.
         limits: Bounds of the elements; None without bounds.
-        by_tolerance: What each of `TOLERANCES` adds to the standard errors of a joint fit, as
-            `Instrument.narrow` has it [relative]; None in other fits and in files.
+        by_tolerance: What errors of the instrument do to the elements; NaN if the method does not
+            compute it, None in files.
     """
 
     circuit: Circuit
@@ -215,7 +216,7 @@ class Fit(Judged, HasSource[Circuit]):
     change_stderr: Float[Array | np.ndarray, "*lane moved"] | None = None
     support: Support | None = None
     limits: Limited | None = None
-    by_tolerance: Float[Array | np.ndarray, "*lane tolerance parameter"] | None = None
+    by_tolerance: Effects | None = None
 
     @property
     def stderr(self) -> Circuit:
@@ -370,6 +371,17 @@ class Fit(Judged, HasSource[Circuit]):
         return " ".join(self._reasons)
 
     @property
+    def unstated(self) -> str:
+        """A sentence on the error of the instrument that exceeds ± most; for one fit.
+
+        Empty if each has a tolerance, moves no element further than ±, or is not known.
+        """
+        if self.by_tolerance is None or self.verdict != "successful":
+            return ""
+        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
+        return largest(self.by_tolerance.unstated, self.circuit.names(), errors / values)
+
+    @property
     def _told(self) -> tuple[str, str]:
         """The method without what was told of elements, and a sentence that says it."""
         return without_known(self.method, self.circuit.units())
@@ -398,5 +410,6 @@ class Fit(Judged, HasSource[Circuit]):
         known = self.measured is None or self.measured.stderr is not None  # else there is no chi2
         title += f", {quality(float(self.rrse), float(self.chi2) if known else np.nan)}"
         outside = "" if verdict == "out_of_bounds" else self.outside
-        notes = [*filter(None, [told, *self._reasons, outside]), *texts(int(self.remarks))]
+        said = filter(None, [told, *self._reasons, outside, self.unstated])
+        notes = [*said, *texts(int(self.remarks))]
         return Overview(title, rows, notes=notes)

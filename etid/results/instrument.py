@@ -1,12 +1,12 @@
 """Errors of an instrument that no recording shows, and what each adds to the standard errors."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from etid.circuits.display import per_cent
 from etid.circuits.overview import Overview, Overviewed
@@ -17,16 +17,34 @@ _Kind = TypeVar("_Kind", bound="Instrument")
 
 # Errors that a fit estimates with the elements. The value is that for which a budget shows the
 # effect of an error that nobody stated [relative, F].
-ERRORS = {"gain": 1e-3, "r_load": 1e-3, "crosstalk": 1e-3, "capacitance": 1e-12}
-BUDGETED = ERRORS | {"drift": 1e-2}
+ERRORS = {
+    "gain": 1e-3,
+    "r_load": 1e-3,
+    "c_load": 1e-12,
+    "crosstalk": 1e-3,
+    "capacitance": 1e-12,
+}
+# Others that a fit of one recording can have. Nobody can state the last one.
+LATER = {"drift": 1e-2, "later gain": 1e-3}
+BUDGETED = ERRORS | LATER
 # Value of each tolerance from which on it has a wrong unit, and the unit.
 TOLERANCES = {
     "gain": (1.0, "relative"),
     "r_load": (1.0, "relative"),
+    "c_load": (1e-7, "F"),
     "crosstalk": (1.0, "relative"),
     "capacitance": (1e-7, "F"),
     "drift": (1.0, "relative"),
     "delay": (1e-3, "s"),
+}
+IN_WORDS = {  # an error of some size
+    "gain": "a gain that is {} off",
+    "r_load": "a known resistor that is {} off",
+    "c_load": "{} across the known resistor",
+    "crosstalk": "{} of crosstalk",
+    "capacitance": "{} across the skin",
+    "drift": "a driver that drifts by {}",
+    "later gain": "a gain that changes by {} after the calibration",
 }
 NARROW = 1e-3  # of a tolerance that nobody stated: a prior that no recording changes
 
@@ -42,6 +60,8 @@ class Instrument(Module):
     Attributes:
         gain: Of the gain of V_out relative to that of V_th, in all recordings [relative].
         r_load: Of each known resistor [relative].
+        c_load: Of the capacitance across each known resistor, of its carrier and leads, that the
+            skins did not have [F].
         crosstalk: Of the part of V_th that V_out shows in all recordings [relative].
         capacitance: Of a capacitance across the skin that the calibrations did not have [F].
         drift: Of the change of each parameter of Z_th between calibration and skin [relative].
@@ -50,6 +70,7 @@ class Instrument(Module):
 
     gain: _Number = 0.0
     r_load: _Number = 0.0
+    c_load: _Number = 0.0
     crosstalk: _Number = 0.0
     capacitance: _Number = 0.0
     drift: _Number | None = 0.0
@@ -86,13 +107,24 @@ class Instrument(Module):
         return cls(**found)
 
     def deviations(self, resistors: int) -> Float[Array, " error"]:
-        """Standard deviations of gain, crosstalk, capacitance, and of each known resistor."""
+        """Standard deviations of gain, crosstalk, capacitance, and of each known resistor.
+
+        Those of the capacitances across the resistors follow.
+        """
         of_loads = self.gain, self.crosstalk, self.capacitance  # change loads directly
-        return jnp.stack([jnp.asarray(of) for of in (*of_loads, *[self.r_load] * resistors)])
+        of_each = self.r_load, self.c_load
+        every = *of_loads, *(of for of in of_each for _ in range(resistors))
+        return jnp.stack([jnp.asarray(of) for of in every])
+
+    def complete(self: _Kind) -> _Kind:
+        """The same with the size in `BUDGETED` for each error that nobody stated."""
+        own = {name: jnp.asarray(getattr(self, name)) for name in ERRORS}
+        sizes = {name: jnp.where(of > 0, of, ERRORS[name]) for name, of in own.items()}
+        return dataclasses.replace(self, **sizes)
 
     def narrow(self: _Kind) -> _Kind:
-        """The same with a small deviation for each tolerance that nobody stated, for a budget."""
-        narrow = {name: NARROW * size for name, size in BUDGETED.items()}
+        """The same with a small deviation for each of `ERRORS` that nobody stated."""
+        narrow = {name: NARROW * size for name, size in ERRORS.items()}
         return type(self)(**(narrow | self.stored())).as_arrays()
 
     def stored(self) -> dict[str, float]:
@@ -116,18 +148,88 @@ class Instrument(Module):
         return type(self)(**errors, drift=told.get("drift"), delay=told.get("delay"))
 
 
-def by_tolerance(effects: Float[Array, "error element"]) -> Float[Array, "tolerance element"]:
-    """Size of the effect of each of `ERRORS`; the errors are those of `deviations`."""
-    gain, crosstalk, capacitance = jnp.abs(effects[:3])
-    r_load = jnp.sqrt(jnp.sum(effects[3:] ** 2, axis=0))  # the resistors are independent
-    return jnp.stack([gain, r_load, crosstalk, capacitance])
+class Effects(Module):
+    """What errors of the instrument do to the elements of a fit, or of a batch of fits.
+
+    Attributes:
+        moved: Relative change of each element by an error of each of `BUDGETED`: by one standard
+            deviation where a tolerance is stated, and by an error of the size in `BUDGETED` where
+            it is not. NaN where this is not known.
+        stated: The tolerance that is stated [relative, F]; 0 without one.
+    """
+
+    moved: Float[Array | np.ndarray, "*lane error element"]
+    stated: Float[Array | np.ndarray, "*lane error"]
+
+    @classmethod
+    def of_errors(
+        cls,
+        moved: Float[Array, "error element"],
+        instrument: Instrument | None,
+        later: Float[Array, "later element"],
+    ) -> "Effects":
+        """The effects of the errors of `Instrument.deviations` and of `LATER`."""
+        gain, crosstalk, capacitance = jnp.abs(moved[:3])
+        of_each = moved[3:].reshape(2, -1, moved.shape[-1])  # the resistors are independent
+        r_load, c_load = jnp.sqrt(jnp.sum(of_each**2, axis=1))
+        of = instrument or Instrument()
+        stated = [getattr(of, name, None) for name in BUDGETED]
+        of_errors = jnp.stack([gain, r_load, c_load, crosstalk, capacitance])
+        return cls(
+            jnp.concatenate([of_errors, jnp.abs(later)]),
+            jnp.stack([jnp.asarray(0.0 if one is None else one) for one in stated]),
+        )
+
+    @classmethod
+    def unknown(cls, elements: int, *lane: int) -> "Effects":
+        """Those of fits whose estimator does not compute them: NaN."""
+        count = len(BUDGETED)
+        return cls(np.full((*lane, count, elements), np.nan), np.full((*lane, count), np.nan))
+
+    def of_elements(self, places: Int[Array | np.ndarray, " element"]) -> "Effects":
+        """The effects on the elements at these places; for one fit."""
+        return dataclasses.replace(self, moved=self.moved[:, places])
+
+    @property
+    def unstated(self) -> dict[str, Float[np.ndarray, " element"]]:
+        """The effects of the errors that nobody stated, by source; for one fit."""
+        of = zip(BUDGETED, np.asarray(self.stated), np.asarray(self.moved), strict=True)
+        return {name: moved for name, told, moved in of if told == 0 and np.isfinite(moved).all()}
 
 
-def _named(source: str, size: float) -> str:
-    """A source with its size, as in "gain 0.1 %"."""
-    return (
-        f"{source} {size * 1e12:g} pF" if source == "capacitance" else f"{source} {100 * size:g} %"
-    )
+def largest(
+    unstated: Mapping[str, Float[np.ndarray, " element"]],
+    names: Sequence[str],
+    errors: Float[np.ndarray, " element"],
+) -> str:
+    """A sentence on the error of the instrument that nobody stated and that exceeds ± most.
+
+    Args:
+        unstated: Relative changes of the elements by errors of the sizes in `BUDGETED`, by source.
+        names: The elements.
+        errors: Their relative standard errors.
+
+    Returns:
+        Empty if no such error moves an element by more than its standard error.
+    """
+    beside = [
+        (float(moved[i] / errors[i]), source, i)
+        for source, moved in unstated.items()
+        for i in np.flatnonzero(
+            (moved > errors) & (errors > 0)
+        ).tolist()  # 0 if an element is fixed
+    ]
+    if not beside:
+        return ""
+    _, source, i = max(beside)
+    what = IN_WORDS[source].format(_size(source, BUDGETED[source]))
+    return f"Not in ±: {what} would move {names[i]} by {per_cent(float(unstated[source][i]))}."
+
+
+def _size(source: str, size: float) -> str:
+    """The size of an error, as in "0.1 %"."""
+    of_capacitance = source in ("c_load", "capacitance")
+    return f"{size * 1e12:g} pF" if of_capacitance else f"{100 * size:g} %"
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -154,13 +256,18 @@ class Budget(Overviewed):
         """Relative standard errors of the elements, from all sources."""
         return np.sqrt(sum(part**2 for part in self.parts.values()))
 
+    @property
+    def largest(self) -> str:
+        """A sentence on the error that nobody stated and that exceeds the standard errors most."""
+        return largest(self.unstated, self.names, self.together)
+
     def _overview(self) -> Overview:
         shown = dict[str, Float[np.ndarray, " element"]]()
         for source, part in self.parts.items():
             size = self.tolerances.get(source)
-            shown[source if size is None else _named(source, size)] = part
+            shown[source if size is None else f"{source} {_size(source, size)}"] = part
         shown["together"] = self.together
         for source, change in self.unstated.items():
-            shown[f"if {_named(source, BUDGETED[source])}"] = change
+            shown[f"if {source} {_size(source, BUDGETED[source])}"] = change
         rows = [(name, *(f"± {per_cent(of)}" for of in part)) for name, part in shown.items()]
         return Overview("Budget of the standard errors", rows, ("", *self.names))

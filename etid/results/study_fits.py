@@ -293,7 +293,7 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
     if isinstance(driver, ContinuousDriver):
         stored |= {
             **_lists(driver, "cov"),
-            **_lists(driver.calibration, "r_load", "delay_samples", "delay_std_samples"),
+            **_lists(driver.calibration, "r_load", "delay_samples", "delay_std_samples", "errors"),
             "instrument": None if driver.instrument is None else driver.instrument.stored(),
             "source": _lists(driver.source),
             "tried": _lists(driver.tried),
@@ -340,6 +340,9 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
     if told is not None:
         numbers = {name: float(_numbers(told, name)) for name in TOLERANCES if name in told}
         instrument = Instrument(**numbers).as_arrays()
+    errors = None
+    if instrument is not None and stored.get("errors") is not None:
+        errors = _numbers(stored, "errors", instrument.deviations(r_load.size).size)
     of, orders = stored["tried"], OrderEvidence.none().bic.size
     adequate = np.asarray(of["adequate"])
     if adequate.dtype.kind != "b" or adequate.shape != (orders,):
@@ -349,7 +352,7 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
         ContinuousDriver,
         source=source,
         cov=_numbers(stored, "cov", size, size),
-        calibration=Calibration(r_load, *delays),
+        calibration=Calibration(r_load, *delays, errors=errors),
         instrument=instrument,
         tried=OrderEvidence(bic, missing_pole, adequate),
     )

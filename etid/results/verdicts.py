@@ -57,8 +57,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     resistors_disagree = (
         "The calibrations with different known resistors show different source impedances. One "
-        "r_load is wrong, or belongs to another record; print the driver to see which one. "
-        "Measure the resistors, and give every r_load in ohm."
+        "r_load is wrong, belongs to another record, or has a capacitance across it; print the "
+        "driver to see which one. Measure the resistors, and give every r_load in ohm."
     )
     implausible = (
         "The source impedance at 1 kHz lies outside `plausible`. Most likely r_load is not in "

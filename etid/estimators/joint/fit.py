@@ -85,7 +85,8 @@ def _start(model: Joint, groups: Sequence[Loads]) -> Float[Array, " common"]:
     count = jnp.maximum(jnp.sum(used, dtype=shown.dtype), 1.0)
     errors = jnp.sum(jnp.where(used[:, None], shown, 0.0), axis=0) / count
     common = of.start()
-    return common + jnp.concatenate([of.following(of.linear(of.near(common))) @ errors, errors])
+    more = errors - of.errors(common)
+    return common + jnp.concatenate([of.following(of.linear(of.near(common))) @ more, more])
 
 
 def _refitted(
@@ -136,4 +137,7 @@ def fit_alone(
     tested = model.lane(uncertain, spectrum, sample_rate, current)
     at = jnp.concatenate([own.vector(), z if uncertain is driver else uncertain.mean])
     other = load_fit.scores_at(tested, at).misfit
-    return Alone(own, least.result, chi2, error, hum, other, model.calibrations.errors(q))
+    errors = jnp.zeros(0)
+    if model.calibrations.instrument is not None and driver.errors is not None:
+        errors = driver.errors.values(z)
+    return Alone(own, least.result, chi2, error, hum, other, errors)

@@ -27,9 +27,9 @@ from jaxtyping import Array, Complex, Float
 
 from etid.estimators.estimate import MAX_STEPS, SOLVER
 from etid.estimators.joint.terms import Joint, Loads, in_turn
-from etid.estimators.maximum_likelihood.calibrations import DENSE, Calibrations
+from etid.estimators.maximum_likelihood.calibrations import DENSE, FAULTS, Calibrations
 from etid.estimators.maximum_likelihood.condensed import apart
-from etid.estimators.maximum_likelihood.given_driver import FAULTS, GivenDriver
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers import successive

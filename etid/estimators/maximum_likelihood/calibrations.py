@@ -25,6 +25,7 @@ from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
 from etid.solvers.matrices import inverse_root
 
+FAULTS = 3  # errors of the instrument that change loads directly: gain, crosstalk, capacitance
 DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 
 
@@ -32,11 +33,12 @@ class Calibrations(eqx.Module):
     """The likelihood of the calibrations of a driver.
 
     In all methods `common` is the vector of the `DriverUnknowns`, followed by the errors of the
-    instrument in their standard deviations: gain, crosstalk, capacitance, and the known resistor of
-    each calibration, which those of equal value share.
-    A gain g, a crosstalk κ and an error θ of the resistor R change the gains to
+    instrument in their standard deviations: gain, crosstalk, capacitance, then the known resistor
+    of each calibration and the capacitance across it, which those of equal value share.
+    A gain g, a crosstalk κ, an error θ of the resistor R and a capacitance C across it change the
+    gains to
 
-        V_out / V_th = (1 + g) R' / (R' + Z_th) + κ,      R' = R (1 + θ).
+        V_out / V_th = (1 + g) R' / (R' + Z_th) + κ,      R' = R (1 + θ) ‖ C.
 
     Attributes:
         source: Z_th identified from the calibrations.
@@ -67,6 +69,11 @@ class Calibrations(eqx.Module):
         """Standard deviation of each error of the instrument."""
         of, count = self.instrument, self.calibration.r_load.size
         return jnp.zeros(0) if of is None else of.deviations(count)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of the `DriverUnknowns`, which the errors of the instrument follow."""
+        return ravel_pytree(self.source)[0].size + self.calibration.r_load.size
 
     def errors(self, common: Float[Array, "*row common"]) -> Float[Array, "*row error"]:
         """The errors of the instrument among the common parameters."""
@@ -107,7 +114,10 @@ class Calibrations(eqx.Module):
         """The common parameters identified from the calibrations alone."""
         vector, _ = ravel_pytree(self.source)
         known = DriverUnknowns(vector, self.calibration.delay_samples).vector()
-        return jnp.concatenate([known, jnp.zeros_like(self.tolerances)])
+        errors = self.calibration.errors
+        if self.instrument is None or errors is None:
+            errors = jnp.zeros_like(self.tolerances)
+        return jnp.concatenate([known, errors])
 
     def named(self, common: Float[Array, " common"]) -> DriverUnknowns:
         """The common parameters by name."""
@@ -138,11 +148,14 @@ class Calibrations(eqx.Module):
         """The gains, and their derivatives with respect to Z_th and to the errors."""
         r_load = self.calibration.r_load
         known = resistance = as_complex(r_load)[:, None]
-        # Records with equal values are of one resistor: they have the error of the first of them.
+        # Records with equal values are of one resistor: they have the errors of the first of them.
         first = jnp.argmax(r_load[:, None] == r_load[None], axis=1)
-        off = as_complex(self.tolerances * self.errors(common))
+        off, s = as_complex(self.tolerances * self.errors(common)), frequency_variable(f)
+        right = known  # R (1 + θ)
         if self.instrument is not None:
-            resistance = known * (1 + off[-known.size :][first, None])
+            of_r, across = off[FAULTS:].reshape(2, -1)[:, first, None]
+            right = known * (1 + of_r)
+            resistance = right * reciprocal(1 + s * across * right)
         loop, late = reciprocal(resistance + z_th), self.named(common).delay_samples
         gains = jax.vmap(delayed, (0, 0, 0, None))(resistance * loop, f, late, self.rate)
         by_z = -gains * loop
@@ -151,9 +164,12 @@ class Calibrations(eqx.Module):
         gain, crosstalk, *_ = off
         inverse = reciprocal(resistance)
         turned = gains * (resistance + z_th) * inverse
-        of_loads = jnp.stack([gains, turned, jnp.zeros_like(gains)])  # nothing is across a resistor
-        of_resistor = -(1 + gain) * by_z * z_th * known * inverse
-        of_each = as_complex(jnp.eye(known.size)[first].T)[:, :, None] * of_resistor[None]
+        of_loads = jnp.stack([gains, turned, jnp.zeros_like(gains)])  # nothing is across a skin
+        # ∂R'/∂θ = R R'² / (R (1 + θ))²,      ∂R'/∂C = −s R'²
+        by_r = -(1 + gain) * by_z * z_th * resistance
+        of_each = jnp.stack([by_r * known * reciprocal(right * right), -s * by_r])
+        alone = as_complex(jnp.eye(known.size)[first].T)[None, :, :, None]
+        of_each = (alone * of_each[:, None]).reshape(-1, *gains.shape)
         by_error = jnp.concatenate([of_loads, of_each])
         by_error = by_error * as_complex(self.tolerances)[:, None, None]
         return (1 + gain) * gains + crosstalk * turned, (1 + gain) * by_z, by_error

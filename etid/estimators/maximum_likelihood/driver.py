@@ -181,8 +181,8 @@ def fit_source(
 ) -> tuple[Calibrations, Estimate, Near, Linear]:
     """Identify Z_th from one or several records with known resistors, stacked.
 
-    The best start is the first; the others are tried only if it does not converge. Of the
-    instrument only the delays matter, because its errors are 0 at the minimum.
+    The best start is the first; the others are tried only if it does not converge. Several records
+    show errors of the instrument, which are then unknowns, too; behind one record they are 0.
 
     Returns:
         The calibrations with Z_th and their delays; the estimate, with parameters in the order of
@@ -191,12 +191,14 @@ def fit_source(
     best = jax.tree.map(lambda leaf: leaf[0], candidates)
     calibration = Calibration(r_load, best.delay_samples, delay_std(r_load))
     width = delay_width(instrument, sample_rate)
-    model = Calibrations(best.source, calibration, spectra, sample_rate, width)
+    told = instrument if r_load.size > 1 else None
+    model = Calibrations(best.source, calibration, spectra, sample_rate, width, told)
+    none = jnp.zeros_like(model.tolerances)
 
     def fit(tried: _Tried) -> _Tried:
         start = jax.tree.map(lambda leaf: leaf[tried.count], candidates)
         q = DriverUnknowns(ravel_pytree(start.source)[0], start.delay_samples).vector()
-        q, least = minimum(model, q)
+        q, least = minimum(model, jnp.concatenate([q, none]))
         new = _Tried(
             count=tried.count + 1,
             start=tried.count,
@@ -209,8 +211,8 @@ def fit_source(
         old = dataclasses.replace(tried, count=new.count)
         return jax.tree.map(lambda one, other: jnp.where(kept, one, other), new, old)
 
-    none = jnp.zeros_like(best.steps)
-    tried = _Tried(none, none, model.start(), jnp.zeros(()), none, jnp.array(False))
+    zero = jnp.zeros_like(best.steps)
+    tried = _Tried(zero, zero, model.start(), jnp.zeros(()), zero, jnp.array(False))
     tried = jax.lax.while_loop(
         lambda tried: ~tried.settled & (tried.count < candidates.cost.size), fit, tried
     )
@@ -218,8 +220,8 @@ def fit_source(
     kept = found.source.size
     near = model.near(q)
     linear = model.linear(near)
-    cov = linear.covariance()[:kept, :kept]
-    freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.size
+    cov = linear.first(model.unknowns).covariance()[:kept, :kept]  # at these errors
+    freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - model.unknowns
     each = [
         (Records.of(s), Profile.of_output(s, g))
         for s, g in zip(as_list(spectra), near.profiles[0].gains, strict=True)
@@ -239,6 +241,7 @@ def fit_source(
         start=tried.start,
         hum=jnp.stack([profile.shows_hum(records) for records, profile in each]).any(),
     )
-    calibration = dataclasses.replace(calibration, delay_samples=found.delay_samples)
-    calibrations = Calibrations(model.source_of(q), calibration, spectra, sample_rate, width)
-    return calibrations, estimate, near, linear
+    errors = None if told is None else model.errors(q)
+    calibration = dataclasses.replace(calibration, delay_samples=found.delay_samples, errors=errors)
+    model = dataclasses.replace(model, source=model.source_of(q), calibration=calibration)
+    return model, estimate, near, linear

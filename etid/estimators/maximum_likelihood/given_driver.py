@@ -19,9 +19,14 @@ terms themselves, for many loads at once. Both estimates have the same errors ag
 they are not equal. They may differ by a standard error along the direction that one known resistor
 does not determine.
 
-**Errors of the instrument** θ are further z with a standard normal prior. A gain g, a crosstalk κ
-and a capacitance C change the outputs of a load (`etid.estimators.maximum_likelihood.gains`); all
-but C also change the calibrations, whose minimum moves by ∂c/∂θ = −H_cc⁻¹ H_cθ.
+**Errors of the instrument** θ with a tolerance are further common parameters. Several known
+resistors tell of them, too. A gain g, a crosstalk κ and a capacitance C change the outputs of a
+load (`etid.estimators.maximum_likelihood.gains`); all but C also change the calibrations. An error
+that nobody stated stays 0 in the fit. If it is not 0, the minimum of the calibrations moves,
+
+    ∂z₀/∂θ = −Lᵀ H_cθ,
+
+and the elements with it.
 """
 
 import dataclasses
@@ -35,19 +40,18 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import FAULTS, Calibrations
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.precision import Module
 from etid.results.driver import HarmonicDriver
+from etid.results.instrument import BUDGETED, Instrument
 from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, combined, reciprocal
 from etid.solvers.matrices import inverse_root
-
-FAULTS = 3  # errors of the instrument that change loads directly: gain, crosstalk, capacitance
 
 
 class UnloadedEstimate(NamedTuple):
@@ -64,6 +68,32 @@ class UnloadedEstimate(NamedTuple):
     variance: Float[Array, " harmonic"]
     x_by_z: Complex[Array, "z harmonic"]
     log_variance_by_z: Float[Array, "z harmonic"]
+
+
+class InstrumentErrors(Module):
+    """Errors of the instrument: those with a tolerance by z, and what the others would change.
+
+    Attributes:
+        at: The errors at z = 0 [their standard deviations].
+        by_z: Their derivatives; 0 for an error that nobody stated.
+        unstated: Changes of z₀ by each error that nobody stated, of the size in `BUDGETED`; 0 for
+            the others.
+        direct: Sizes of gain, crosstalk and capacitance that nobody stated; 0 for the others.
+        drift: Changes of z₀ by a drift of each parameter of Z_th that nobody stated, and by one
+            standard deviation of a drift with a tolerance.
+        told: The instrument; None without one.
+    """
+
+    at: Float[Array, " error"]
+    by_z: Float[Array, "z error"]
+    unstated: Float[Array, "z error"]
+    direct: Float[Array, "3"]
+    drift: Float[Array, "z parameter"]
+    told: Instrument | None
+
+    def values(self, z: Float[Array, " z"]) -> Float[Array, " error"]:
+        """The errors [their standard deviations]."""
+        return self.at + z @ self.by_z
 
 
 class GivenDriver(Module):
@@ -85,6 +115,7 @@ class GivenDriver(Module):
         delay_width: Prior standard deviation of the trigger delay of a load [samples].
         faults: Gain, crosstalk and capacitance at z = 0 and by z; None if the instrument has no
             tolerances.
+        errors: The errors of the instrument; None if they are not known.
         aside: Distance of the first delay of a search from that of its start [samples].
         by_current: Whether the input is a measured current: the gain is Z_L, and there is no z.
     """
@@ -102,6 +133,7 @@ class GivenDriver(Module):
     shape: UnloadedShape | None = None
     delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
     faults: tuple[Float[Array, "3"], Float[Array, "z 3"]] | None = None
+    errors: InstrumentErrors | None = None
     aside: Float[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     by_current: bool = eqx.field(static=True, default=False)
 
@@ -201,30 +233,46 @@ def given(
 
     `shared` says whether the unloaded record of a load may be that of a calibration.
     """
-    calibrations = Calibrations.of(driver)
-    c = calibrations.start()
-    near = calibrations.near(c)
-    linear = calibrations.linear(near)
-    curvature, errors = linear.curvature().expected, calibrations.tolerances.size
-    known = c.size - errors
-    root = inverse_root(curvature[:known, :known])
-    mean = -root.T @ calibrations.gradient(near, linear)[:known]
-    cov = linear.along(jnp.pad(root, ((0, errors), (0, 0)))).curvature().score
-    # Later changes of the driver and errors of the instrument are further z.
-    later = jnp.zeros((known, 0))
-    if driver.drift is not None:
+    calibrations, told = Calibrations.of(driver), driver.instrument
+    c, unknowns = calibrations.start(), calibrations.unknowns
+    # Those that nobody stated have a size, too, so that their effects are known.
+    every = dataclasses.replace(calibrations, instrument=(told or Instrument()).complete())
+    sizes = every.tolerances
+    at = jnp.concatenate([c[:unknowns], jnp.zeros_like(sizes) if told is None else c[unknowns:]])
+    near = every.near(at)
+    linear = every.linear(near)
+    stated = jnp.zeros_like(sizes)
+    if told is not None:
+        stated = jnp.where(calibrations.tolerances > 0, 1.0, 0.0)
+    free = jnp.concatenate([jnp.ones(unknowns), stated])[: c.size]
+    curvature = linear.curvature().expected
+    fixed = jnp.diag(1 - free)
+    own = curvature[: c.size, : c.size] * free[:, None] * free[None] + fixed
+    directions = free[:, None] * inverse_root(own)
+    mean = -directions.T @ every.gradient(near, linear)[: c.size]
+    along = jnp.pad(directions, ((0, at.size - c.size), (0, 0)))
+    cov = linear.along(along).curvature().score + fixed
+    unstated = -directions.T @ curvature[: c.size, unknowns:] * (1 - stated)[None]
+    drift = driver.drift_std(BUDGETED["drift"])
+    drift = directions.T @ own[:, : drift.size] * drift[None]
+    if driver.drift is not None:  # later changes are further z
         std = driver.drift_std()
-        later = jnp.pad(jnp.diag(std), ((0, known - std.size), (0, 0)))
-    directions = jnp.concatenate([root, later, calibrations.following(linear)], axis=1)
-    more = directions.shape[1] - known
-    directions = jnp.concatenate([directions, jnp.eye(errors, known + more, known + more - errors)])
-    mean = jnp.pad(mean, (0, more))
-    cov = jax.scipy.linalg.block_diag(cov, jnp.eye(more))
+        drift = jnp.concatenate([jnp.zeros_like(drift), jnp.eye(std.size)])
+        later = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
+        directions = jnp.concatenate([directions, later], axis=1)
+        mean, unstated = (
+            jnp.concatenate([of, jnp.zeros((std.size, *of.shape[1:]))]) for of in (mean, unstated)
+        )
+        cov = jax.scipy.linalg.block_diag(cov, jnp.eye(std.size))
     found = around(calibrations, c, directions, frequency, shared, mean, cov)
     if found.gain_slopes is not None:  # the calibrations tell nothing about later changes
-        gain_slopes = found.gain_slopes.at[known : known + later.shape[1]].set(0.0)
+        gain_slopes = found.gain_slopes.at[c.size :].set(0.0)
         found = dataclasses.replace(found, gain_slopes=gain_slopes)
-    return dataclasses.replace(found, shape=shape_of(driver, frequency))
+    by_z = jnp.pad(directions[unknowns:].T, ((0, 0), (0, at.size - c.size)))
+    errors = InstrumentErrors(
+        at[unknowns:], by_z, unstated, ((1 - stated) * sizes)[:FAULTS], drift, told
+    )
+    return dataclasses.replace(found, shape=shape_of(driver, frequency), errors=errors)
 
 
 def around(

@@ -27,7 +27,13 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver, Unloade
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.signals.knots import Knots, knots
-from etid.signals.transfer import as_complex, combined, reciprocal, turns
+from etid.signals.transfer import (
+    as_complex,
+    combined,
+    frequency_variable,
+    reciprocal,
+    turns,
+)
 
 
 class Load(eqx.Module):
@@ -133,6 +139,15 @@ def changes(load: Load, near: Near) -> Complex[Array, "change output knot"]:
     alone = np.eye(load.gains.outputs, dtype=complex)[:, :, None]
     scales = alone * near.slopes.gains[None]
     return jnp.concatenate([circuits[:, None] * near.slopes.by_z[None], scales])
+
+
+def by_instrument(load: Load, near: Near) -> Complex[Array, "2 output knot"]:
+    """Derivatives of the gains with respect to crosstalk and capacitance of the instrument."""
+    slopes, at = near.slopes, load.gains.at(load.knots)
+    first = np.eye(load.gains.outputs, dtype=complex)[0][:, None]
+    crosstalk = first * at.turned(near.q, jnp.ones_like(slopes.gains), at.frequency)
+    by_capacitance = -frequency_variable(at.frequency) * slopes.z * slopes.z
+    return jnp.stack([crosstalk, by_capacitance[None] * slopes.by_z])
 
 
 def by_layer(load: Load, near: Near) -> Complex[Array, "1 output knot"]:

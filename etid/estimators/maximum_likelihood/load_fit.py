@@ -15,10 +15,17 @@ from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import judged, unless
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import FAULTS, Calibrations
 from etid.estimators.maximum_likelihood.condensed import Near, means
+from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import around
-from etid.estimators.maximum_likelihood.load import Load, by_falling, by_layer, changes
+from etid.estimators.maximum_likelihood.load import (
+    Load,
+    by_falling,
+    by_instrument,
+    by_layer,
+    changes,
+)
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import best_start, minimum
 from etid.estimators.sandwich import Linear
@@ -26,11 +33,11 @@ from etid.estimators.score_tests import SEEN, falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
 from etid.results.fit import Fit, Support
+from etid.results.instrument import BUDGETED, Effects
 from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, combined, power
 from etid.solvers.matrices import inverse_root, root
-from etid.solvers.successive import Minimum
 
 # Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
 # 200 fits were wrong by five standard errors; both exceed it.
@@ -88,7 +95,8 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     moved = jnp.sqrt(jnp.max(jnp.where(used, power(load.gains.at(every).w(z)), 0.0)))
     fitted = _fitted(load, at, information)
     tested = changes(load, near)
-    rows = condensed.rows(jnp.concatenate([by_layer(load, near), tested]))
+    every_change = [by_instrument(load, near), by_layer(load, near), tested]
+    of_instrument, rows = jnp.split(condensed.rows(jnp.concatenate(every_change)), [2])
     found = other_circuit.scores(rows, linear, condensed.part, fitted)
     outputs = load.gains.outputs
     of_layer, of_circuit, of_scales = (
@@ -100,7 +108,9 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     falling = falling_resistance.score(added, near, every, share, noise, fitted)
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
     of_gain = -outputs
-    others = linear.told(rows[of_gain][None])[0] @ information
+    direct = jnp.concatenate([rows[of_gain][None], of_instrument])
+    direct = linear.told(direct) @ information
+    others = direct[0]
     slopes = near.by_unknown(near.slopes)
     made = combined(others, slopes.reshape(at.size, -1)).reshape(slopes.shape[1:])
     explained = (as_complex(-found.size[of_gain]) * profile.x)[None, :] * every.between(
@@ -123,6 +133,9 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     # Σ r² of the priors of elements, which a choice of circuits must weigh.
     beside = jnp.sum(load.rest(at)[:count] ** 2)
     squares, terms = 2 * profile.objective, load.terms
+    effects = None
+    if driver.errors is not None:
+        effects = _effects(load.gains, information, direct)
     estimate = Estimate(
         parameters=logs,
         delay_samples=late,
@@ -136,6 +149,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
         hum=profile.shows_hum(records) & ~wrong_gain,
         falls=falling.causes(squares, terms, other.relevant()),
         doubtful=likely,
+        by_tolerance=effects,
         support=Support(
             squares + strain + beside - 2 * least.promised,
             terms,
@@ -148,9 +162,10 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     contradicts = of_scales.contradicts()[1:].any()
     width = load.gains.widths(at)[count]  # of the prior of the delay of V_out
     contradicts |= beyond(late[0] / width, information[count, count] / width**2)
-    if driver.faults is not None:
-        tolerated = jnp.any(driver.faults[1] != 0, axis=1)
-        contradicts |= beyond(jnp.where(tolerated, z, 0.0), jnp.diagonal(information)[owned:])
+    if driver.errors is not None and driver.errors.told is not None:
+        by_z = driver.errors.by_z[:, :FAULTS]  # the calibrations show those of their resistors
+        variance = jnp.sum(by_z * (information[owned:, owned:] @ by_z), axis=0)
+        contradicts |= beyond(driver.errors.values(z)[:FAULTS], variance)
     return Found(estimate, moved > FAR, wrong, contradicts)
 
 
@@ -160,10 +175,21 @@ def beyond(z: Float[Array, "*error"], variance: Float[Array, "*error"]) -> Bool[
     return jnp.any(z**2 > SEEN**2 * jnp.where(left > UNSEEN, left, jnp.inf))
 
 
-def covariance_of_priors(load: Load, least: Minimum) -> Float[Array, "q q"]:
-    """H⁻¹: how the parameters move with the means of their priors."""
-    near = least.near
-    return _linear(load, near, near.profile.excess(load.known(near.q)))[0].bread()
+def _effects(
+    gains: Gains, information: Float[Array, "q q"], direct: Float[Array, "3 q"]
+) -> Effects:
+    """Changes of the logarithms of the elements by errors of the instrument.
+
+    A change of the prior mean of z by ζ moves them by H⁻¹ ζ. `direct` is what the parameters do of
+    gain, crosstalk and capacitance of the record alone.
+    """
+    errors, elements = gains.driver.errors, information[: gains.elements, gains.owned :]
+    assert errors is not None
+    moved = (elements @ (errors.by_z + errors.unstated)).T
+    moved = moved.at[:FAULTS].add(-errors.direct[:, None] * direct[:, : gains.elements])
+    drift = jnp.sqrt(jnp.sum((elements @ errors.drift) ** 2, axis=1))
+    later = jnp.stack([drift, BUDGETED["later gain"] * direct[0, : gains.elements]])
+    return Effects.of_errors(moved, errors.told, later)
 
 
 def other_circuit_at(

@@ -20,8 +20,15 @@ visible: Z_th has the same relative error. Several resistors must show the same 
 resistor the score test estimates how far its value differs from the value that the others show,
 with
 
-    ∂G/∂ log R = G Z_th / (R + Z_th) = G (1 − G₀),      G = G₀ e^(−jωτ).
+    ∂G/∂ log R = G Z_th / (R + Z_th) = G (1 − G₀),      G = G₀ e^(−jωτ),
+
+and how large a capacitance C is across it, which changes log R by −s R C. A missing pole and such a
+capacitance imitate each other. The likelier of both is named: if the order was too low, the
+statistic of a section is four times that of a capacitance, and if 1 to 10 pF were across a
+resistor, that of the capacitance is 1.0 to 3 times the other.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +38,7 @@ from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.condensed import Near, means
 from etid.estimators.sandwich import Linear
 from etid.recordings.preflight import Inspected
-from etid.signals.transfer import as_complex, combined, reciprocal
+from etid.signals.transfer import as_complex, combined, frequency_variable, reciprocal
 
 MISSING_POLE = (
     36.0  # χ² of two degrees of freedom; by chance one of about 100 sections has it once in 10⁶
@@ -44,6 +51,8 @@ RESISTOR = 5.0
 # Relative error. Resistors of 0.1 % and meters are better. A smaller error changes an element by no
 # more than this.
 SMALLEST = 0.005
+# [F] A larger capacitance across the known resistor changes an element by 1 % or more at 60 dB.
+BRIDGE = 0.25e-12
 # Part of the excess of chi2 that one wrong resistor must explain. Otherwise the records have
 # another fault, which can imitate a wrong resistor.
 EXPLAINED = 0.5
@@ -94,39 +103,71 @@ def missing_pole(
     return (s * s * bb - 2 * s * t * ab + t * t * aa) / (aa * bb - ab * ab)
 
 
-def mismatch(calibrations: Calibrations, near: Near, linear: Linear) -> Float[Array, "2 record"]:
-    """Excess of each log R over the value that the other calibrations show, and its standard error.
+class Mismatch(NamedTuple):
+    """What each known resistor shows beyond its value and the other calibrations.
 
-    `near` and `linear` are those of the minimum.
+    Attributes:
+        off: Excess of log R, and its standard error.
+        across: Capacitance across the resistor [F], and its standard error.
+    """
+
+    off: Float[Array, "2 record"]
+    across: Float[Array, "2 record"]
+
+
+def mismatch(calibrations: Calibrations, near: Near, linear: Linear) -> Mismatch:
+    """What is wrong with each known resistor; `near` and `linear` are those of the minimum.
+
+    Stated tolerances are in the errors, because `linear` has the errors of the instrument.
     """
     slopes, every = near.slopes, calibrations.knots
     alone = as_complex(jnp.eye(slopes.gains.shape[0]))[:, :, None]
     by_resistor = alone * (-slopes.z * slopes.by_z)[None]
-    rows = near.condensed.rows(by_resistor)
+    # ∂ log Z / ∂C of Z = R ‖ C at C = 0 is −s R.
+    s = frequency_variable(every.at(calibrations.spectra.frequency))
+    across = -s * as_complex(calibrations.calibration.r_load)[:, None]
+    changes = jnp.concatenate([by_resistor, across[None] * by_resistor])
+    rows = near.condensed.rows(changes)
     directions, others = linear.projected(rows)
     own = jnp.sum(rows * linear.share[None, :] * directions, axis=1)
     score = directions @ near.condensed.part - others @ calibrations.rest(near.q)
-    # Estimate the noise after the resistor that explains most: its error must not count as noise.
+    # Estimate the noise after the change that explains most: its error must not count as noise.
     best = jnp.argmax(score**2 / own)
     made = combined(others[best], slopes.by_unknown.reshape(linear.jacobian.shape[0], -1))
-    change = (made.reshape(slopes.gains.shape) - by_resistor[best]) * as_complex(score / own)[best]
+    change = (made.reshape(slopes.gains.shape) - changes[best]) * as_complex(score / own)[best]
     part = calibrations.terms(near.profiles[0].gains + every.between(change))
     noise = means(near.profiles, every, calibrations.noise(part)[None])
     of_priors = jnp.sum((others @ linear.precision) * others, axis=1)
     error = jnp.sqrt(jnp.sum(noise * directions**2, axis=1) + of_priors) / own
-    return jnp.stack([score / own, error])
+    found = jnp.stack([score / own, error]).reshape(2, 2, -1)
+    # Of a capacitance the value that was entered is 0: the others show its excess, up to the sign.
+    return Mismatch(found[:, 0], jnp.array([[-1.0], [1.0]]) * found[:, 1])
 
 
 def disagree(
-    mismatch: Float[Array, "2 record"], chi2: Float[Array, ""], terms: Float[Array, ""]
+    mismatch: Float[Array, "2 record"],
+    chi2: Float[Array, ""],
+    terms: Float[Array, ""],
+    smallest: float = SMALLEST,
 ) -> Bool[Array, ""]:
-    """Whether a known resistor is seen to be wrong."""
+    """Whether a known resistor is seen to be wrong by more than `smallest`."""
     off, error = mismatch
     squares = (off / error) ** 2
     # The errors use the noise without the wrong resistor; χ² uses the noise of the records.
     left = jnp.maximum(chi2 / (1 + squares / terms), 1.0)
     explained = squares * left > EXPLAINED * (chi2 - 1) * terms
-    return jnp.any((squares > RESISTOR**2) & (jnp.abs(off) > SMALLEST) & explained)
+    return jnp.any((squares > RESISTOR**2) & (jnp.abs(off) > smallest) & explained)
+
+
+def bridged(
+    across: Float[Array, "2 record"],
+    chi2: Float[Array, ""],
+    terms: Float[Array, ""],
+    missing_pole: Float[Array, ""],
+) -> Bool[Array, ""]:
+    """Whether a capacitance across a known resistor is seen, and no likelier missing pole."""
+    likelier = jnp.max((across[0] / across[1]) ** 2) > missing_pole
+    return likelier & disagree(across, chi2, terms, BRIDGE)
 
 
 def rough_impedance(calibration: Inspected, r_load: float) -> float:
