@@ -76,8 +76,8 @@ def alarms(electrodes: int, snr_db: float, hours: float) -> dict[str, float]:
             settled = state
             continue
         for change in tracker.changes(state):
-            false += change.electrode is not None
-            driver += change.electrode is None
+            false += change.kind != "driver"
+            driver += change.kind == "driver"
     assert settled is not None
     dry = np.flatnonzero(loads == 0)
     wet = dry[: int(WET * electrodes)]

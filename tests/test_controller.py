@@ -156,6 +156,34 @@ def test_limits_hold_and_are_named(limits, reason):
         assert guards[1] == pytest.approx(guards[0], rel=1e-6)
 
 
+@pytest.mark.parametrize("probability", [0.9, 1 - 1e-9])
+def test_the_caps_leave_room_for_the_stated_probability(probability):
+    """k from the tables of the normal distribution; σ as in the equations of the controller."""
+    k = {0.9: 1.2815515655, 1 - 1e-9: 5.9978070150}[probability]
+    caps = {"charge_cap": 50e-9, "probability": probability}
+    (controller, state), model = controlled(**caps), ten()[0].model
+    state = with_lanes(state, information=[0.01 * np.asarray(state.electrodes.information[0])] * 2)
+    command = controller.command(state, charge=200e-9)
+    assert set(command.reason) == {"charge"}
+    spent = controller.model.rest * (command.charge + k * command.charge_stderr)
+    np.testing.assert_allclose(spent, 50e-9, rtol=1e-9)
+    assert (command.charge_stderr > 5e-4 * command.charge).all()  # k matters
+    # Without the guard, which is smaller, the cap on the current acts.
+    controller, _ = controlled(current_cap=0.4e-3, probability=probability)
+    free = controller.limits._replace(guard=jnp.asarray(jnp.inf))
+    command = dataclasses.replace(controller, limits=free).command(state, charge=200e-9)
+    assert set(command.reason) == {"peak"}
+    own, information = state.electrodes.own[0, :-1], state.electrodes.information[0]
+    now = eqx.filter_jit(controller.model.current)(model.circuit, own, jnp.linalg.inv(information))
+    spent = command.amplitude[0] * (now.peak + k * now.peak_stderr)
+    np.testing.assert_allclose(spent, 0.4e-3, rtol=1e-6)
+    assert now.peak_stderr > 5e-4 * now.peak
+    # The fallback, too, has k errors of the calibrations.
+    short = [float(controller.model.short_charge(jnp.asarray(of))) for of in (0.0, k)]
+    assert controller.short == pytest.approx(short[1], rel=1e-9)
+    assert short[1] > short[0] * (1 + 1e-5)
+
+
 def test_an_electrode_that_is_not_good_gets_the_fallback_and_says_so():
     (controller, state), (tracker, _, clean) = controlled(fallback=0.2), ten()
     first = controller.command(tracker.start(), charge=80e-9)

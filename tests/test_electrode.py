@@ -19,7 +19,8 @@ from etid.online.alarms import SEEN_IN_PULSES, PulseScores
 from etid.online.gain_bands import Bands
 from etid.online.projection import Seen
 from etid.online.pulse_fit import Expected, GainModel
-from etid.online.state import DRIFT, JUMP, NONE, ElectrodeState, TrackerState
+from etid.online.repeats import Windows
+from etid.online.state import DRIFT, JUMP, NONE, REPEATED, ElectrodeState, TrackerState
 from etid.online.tick import (
     PATIENCE,
     Attempt,
@@ -53,23 +54,18 @@ class Case(NamedTuple):
     off: bool
     near: bool
     gain: bool
+    old: str
 
 
-USUAL = Case(True, False, False, True, "good", False, 0, False, False, False)
+USUAL = Case(True, False, False, True, "good", False, 0, False, False, False, "no")
+EITHER = (True, False)
+KINDS: list[tuple[Any, ...]] = [
+    *(EITHER, EITHER, EITHER, EITHER, ("good", "bad", "late"), EITHER, (0, PATIENCE - 1)),
+    *(EITHER, EITHER, EITHER, ("no", "first", "again")),
+]
 CASES = [
     Case(*one)
-    for one in itertools.product(
-        (True, False),
-        (True, False),
-        (True, False),
-        (True, False),
-        ("good", "bad", "late"),
-        (True, False),
-        (0, PATIENCE - 1),
-        (True, False),
-        (True, False),
-        (True, False),
-    )
+    for one in itertools.product(*KINDS)
     if one[0] or not (one[1] or one[2])  # an electrode that does not run is not suspected
 ]
 # NumPy's arrays stand in the place of JAX's.
@@ -89,7 +85,7 @@ def electrode(of: Case) -> tuple[Any, ...]:
         missed=of.missed,
         amplitude=0.5,
         offset=0.25,
-        shown=np.array([5.0, 6.0]),
+        repeated=of.old == "again",
         scores=np.array([[30.0, 100.0, 1.0], [0.0, 1.0, 1.0]]),
         shape=SHAPE,
         confirmed=0.7,
@@ -113,7 +109,7 @@ def electrode(of: Case) -> tuple[Any, ...]:
         amplitude=0.0 if of.silent else 2.0,
         offset=1.25,
         steady=True,
-        shown=4.0,
+        repeated=of.old != "no",
         bad=RESULTS.unconnected if of.off else SUCCESSFUL,
     )
     sums = [[-150.0 if of.gain else 1.0, 90.0, 2.0], [1.0, 1.0, 0.0]]
@@ -180,13 +176,13 @@ def expected(of: Case) -> dict[str, Any]:
         "missed": missed,
         "amplitude": measured.amplitude,
         "offset": measured.offset,
-        "shown": [4.0, 5.0],
+        "repeated": measured.repeated,
         "confirmed": confirmed,
         "scores": sums,
         "shape": used.information / 2 if good else state["shape"],  # 2 is the weight
         "mean": mean,
         "mean_cov": mean_cov,
-        "event": JUMP if jumped else DRIFT if drifted else NONE,
+        "event": JUMP if jumped else DRIFT if drifted else REPEATED if of.old == "first" else NONE,
         "factor": factor if jumped or drifted else state["factor"],
         "element": which if jumped else 0 if drifted else state["element"],
         "drifted": number if drifted else state["drifted"],
@@ -385,6 +381,15 @@ def test_the_driver_has_changed_if_most_electrodes_move_one_way(test):
         assert not bool(driver_changed(*map(jnp.asarray, (jumped, values, counts, running))))
 
 
+@pytest.mark.parametrize("opposite", range(5))
+def test_nine_tenths_of_the_electrodes_are_the_driver(opposite):
+    values = np.full((2, LANES), SURE + 0.01)
+    values[:, :opposite] *= -1
+    counts, none = np.ones(LANES, bool), np.zeros(LANES, bool)
+    found = driver_changed(*map(jnp.asarray, (none, values, counts, counts)))
+    assert bool(found) == (LANES - opposite >= 0.9 * LANES)
+
+
 def state_of(**fields: Any) -> TrackerState:
     """A state after pulse 100 of as many electrodes as a field has."""
     count = max(len(value) for value in fields.values())
@@ -398,7 +403,8 @@ def state_of(**fields: Any) -> TrackerState:
     lanes["result"] = jax.tree.map(jnp.asarray, verdicts_of(np.array(verdicts)))
     lanes |= {name: jnp.asarray(value) for name, value in fields.items()}
     no = jnp.asarray(False)
-    return TrackerState(ElectrodeState(**lanes), jnp.asarray(100), no, no)
+    empty = Windows(slice(0), np.zeros((0, 1), np.uint64), np.zeros((0, 1), np.uint32))
+    return TrackerState(ElectrodeState(**lanes), jnp.asarray(100), no, no, empty)
 
 
 def test_what_a_pulse_has_shown_is_listed():
@@ -410,10 +416,38 @@ def test_what_a_pulse_has_shown_is_listed():
     assert (jump.pulse, jump.electrode, jump.kind, jump.element) == (100, 1, "jump", "r_p")
     assert (drift.electrode, drift.kind, drift.element) == (2, "drift", "r_s")
     np.testing.assert_allclose([jump.factor, drift.factor], [5.0, 6.0])
+    assert jump.words("E2") == "jump of r_p, to 5 times its value, at E2"
     driver = dataclasses.replace(state, driver_event=jnp.asarray(True))
     [found] = states.changes(driver, ("r_s", "r_p"))
     assert (found.pulse, found.electrode, found.kind, found.element) == (100, None, "driver", "")
     assert np.isnan(found.factor)
+    assert found.words("") == "the driver has changed; calibrate again"
+
+
+@pytest.mark.parametrize(
+    ("events", "listed", "where"),
+    [
+        ([REPEATED, JUMP, NONE, NONE], [(1, "jump"), (0, "repeated")], "at E1"),
+        ([REPEATED, REPEATED, NONE, NONE], [(0, "repeated"), (1, "repeated")], "at E2"),
+        ([REPEATED, REPEATED, REPEATED, JUMP], [(3, "jump"), (None, "repeated")], "at most elect"),
+        ([REPEATED], [(0, "repeated")], "at E1"),
+    ],
+)
+def test_windows_that_repeat_are_an_alarm_and_one_alarm_if_most_electrodes_do(
+    events, listed, where
+):
+    count = len(events)
+    state = state_of(
+        event=np.array(events), element=np.zeros(count, int), factor=np.zeros((count, 2))
+    )
+    found = states.changes(state, ("r_s", "r_p"))
+    assert [(one.electrode, one.kind) for one in found] == listed
+    at = found[-1].electrode
+    text = found[-1].words("" if at is None else f"E{at + 1}")
+    assert text.startswith(f"old windows return {where}")
+    assert "buffer is not filled" in text
+    assert "Check the acquisition" in text
+    assert len(f"Pulse 1234567: {text}") < 200  # bytes of an alarm of the live page
 
 
 def test_an_electrode_that_cannot_be_used_has_the_first_reason_that_applies():
@@ -466,6 +500,7 @@ def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch
         (1.0, 2.0, 0.1, 1e-3, 1e-1, False, np.nan, "too_short"),
         (1.0, 1.0, 0.1, 1e-3, 1e-1, False, 0.2, "flat"),
         (0.0, 1.0, 0.1, 0.995, 1e-3, False, 0.2, "flat"),
+        (1.0, 1.0, 0.1, 0.5, 1e-3, False, 0.2, "repeated"),
         (1.0, 1.0, 0.1, 0.9902, 1e-6, False, 0.2, "unconnected"),
         (1.0, 1.0, 0.1, 0.9898, 1e-6, False, 0.2, "successful"),
         (1.0, 1.0, 0.1, 1.0098, 1e-6, False, 0.2, "unconnected"),
@@ -488,7 +523,7 @@ def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch
     object.__setattr__(bands, "weight", jnp.asarray(weight))
     zero = np.zeros(len(rows))
     sums = np.stack([*np.zeros((6, len(rows))), mean, zero, zero], axis=1)
-    seen = Seen(sums, variance, clipped)
+    seen = Seen(sums, variance, clipped, (verdict == "repeated") | (verdict == "flat"))
     state = state_of(amplitude=before, offset=offset).electrodes
     found = tick.measured_pulse(bands, seen, jnp.asarray(amplitude), state)
     relative = np.where(amplitude > 0, amplitude, 1.0)

@@ -175,9 +175,12 @@ def test_errors_and_derivatives_are_not_printed_as_a_circuit():
 def test_a_layout_and_a_change_are_a_sentence():
     assert str(etid.Layout.grid(2, 3, 1e-3)) == "Layout of 6 electrodes, E1 … E6: 2 x 1 mm"
     assert str(Change(7, 3, "jump", "c_p", 1.2345)) == (
-        "pulse 7, electrode 3: jump, c_p is 1.23 times what it was"
+        "pulse 7: jump of c_p, to 1.2 times its value, at electrode 3"
     )
-    assert str(Change(7, None, "driver", "", np.nan)) == "pulse 7: the driver has changed"
+    assert (
+        str(Change(7, None, "driver", "", np.nan))
+        == "pulse 7: the driver has changed; calibrate again"
+    )
 
 
 def test_several_circuits_say_how_many_and_one_does_not():

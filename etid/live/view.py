@@ -138,13 +138,7 @@ class LiveView:
         """
         pulse = f"Pulse {tick.number + 1}: "
         for change in tick.changes:
-            if change.electrode is None:
-                text = "the driver has changed; calibrate again"
-            else:
-                text = (
-                    f"{change.kind} of {change.element}, to {change.factor:.2g} times its value, "
-                    f"at {self._names[change.electrode]}"
-                )
+            text = change.words("" if change.electrode is None else self._names[change.electrode])
             self._alarms.appendleft(pulse + text)
         self._slowest = max(self._slowest, tick.seconds)
         now = time.monotonic()

@@ -38,7 +38,9 @@ shows whether the record follows the amplitude of its own electrode: another cha
 
 **An electrode whose verdict is not good** gets the fallback amplitude, which is at most a_s, or
 less if a limit says so. Until it starts again, it gets no more than at the last pulse. The command
-says `fallback` for it, and its charge is NaN.
+says `fallback` for it, and its charge is NaN. **An electrode whose last window was an old one**
+(`etid.online.repeats`) gets 0 until a window is new, because nothing that it is given can be
+seen. The command says `repeated`.
 """
 
 import dataclasses
@@ -49,7 +51,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import number, rounded, several
@@ -65,8 +67,9 @@ from etid.results.verdicts import counts
 from etid.solvers.matrices import inverse_of_few
 
 REASONS = np.array(
-    ["wanted", "peak", "charge", "confirmed", "guard", "voltage", "slew", "fallback"]
+    ["wanted", "peak", "charge", "confirmed", "guard", "voltage", "slew", "fallback", "repeated"]
 )
+FALLBACK, REPEATED = len(REASONS) - 2, len(REASONS) - 1
 LARGEST_CAP = 0.1  # [A] stimulators of nerves and skin stay below it
 RAISE = 1.25  # of an amplitude that a pulse has confirmed, to the next pulse
 
@@ -77,11 +80,12 @@ class Command(Overviewed):
 
     Attributes:
         amplitude: Primary amplitude at each electrode, relative to that of the unloaded record.
-        charge: Expected charge per phase [C]; NaN where the amplitude is the fallback.
+        charge: Expected charge per phase [C]; NaN where there is no good estimate.
         charge_stderr: Its standard error [C].
-        peak: Expected largest current [A]; NaN where the amplitude is the fallback.
+        peak: Expected largest current [A]; NaN where there is no good estimate.
         worst: Charge if the load has become a short circuit since the last pulse [C].
-        reason: What determined the amplitude: `wanted`, the name of a limit, or `fallback`.
+        reason: What determined the amplitude: `wanted`, the name of a limit, `fallback`, or
+            `repeated`.
     """
 
     amplitude: Float[np.ndarray, " lane"]
@@ -297,7 +301,8 @@ class Controller(Overviewed, Kept):
                 self.tracker.change,
                 self.model,
                 self.limits,
-                state,
+                state.electrodes,
+                state.driver_changed,
                 wanted,
             )
         )
@@ -311,7 +316,8 @@ def _commanded(
     change: Float[Array, ""],
     model: CurrentModel,
     limits: Limits,
-    state: TrackerState,
+    electrodes: ElectrodeState,
+    driver_changed: Bool[Array, ""],
     wanted: Float[Array | np.ndarray, " lane"],
 ) -> Float[Array, "row lane"]:
     """The fields of `Command` as rows of one array: each array of a result costs time.
@@ -324,7 +330,7 @@ def _commanded(
         # The inverse of `predicted`, in one step.
         cov = inverse_of_few(lane.information) + change**2 * jnp.eye(lane.information.shape[0])
         now = model.current(circuit, LoadUnknowns.of(lane.own).log_elements, cov)
-        good = ~state.driver_changed & (lane.result == SUCCESSFUL) & (lane.pulses > 0)
+        good = ~driver_changed & ~lane.repeated & (lane.result == SUCCESSFUL) & (lane.pulses > 0)
         good = good & (now.charge > 0) & (now.charge_stderr < now.charge)
         most = jnp.stack(
             [
@@ -345,9 +351,10 @@ def _commanded(
         safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), limits.short[None], most[4:]])
         applied = jnp.where(good, most, safe)
         reason = jnp.argmin(applied)
-        amplitude = applied[reason]
+        amplitude = jnp.where(lane.repeated, 0.0, applied[reason])
         expected = amplitude * jnp.stack([now.charge, now.charge_stderr, now.peak])
-        reason = jnp.where(good, reason, len(REASONS) - 1).astype(amplitude.dtype)
+        reason = jnp.where(good, reason, jnp.where(lane.repeated, REPEATED, FALLBACK))
+        reason = reason.astype(amplitude.dtype)
         return jnp.stack([amplitude, *jnp.where(good, expected, jnp.nan), reason])
 
-    return jax.vmap(electrode, out_axes=1)(state.electrodes, jnp.asarray(wanted))
+    return jax.vmap(electrode, out_axes=1)(electrodes, jnp.asarray(wanted))

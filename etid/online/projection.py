@@ -35,11 +35,14 @@ class Seen(NamedTuple):
             of `Means`. Ĝ includes the phase of the delay.
         variance: E|noise|² of a Fourier coefficient of V_out [V²].
         clipped: Whether a sample reached the end of the converter's range.
+        repeated: Whether the window is an old one (`etid.online.repeats`), which it does not show
+            by itself.
     """
 
     sums: Float[Array | np.ndarray, "lane sum"]
     variance: Float[Array | np.ndarray, " lane"]
     clipped: Bool[Array | np.ndarray, " lane"]
+    repeated: Bool[Array | np.ndarray, " lane"]
 
     def gain(self) -> Complex[Array, "lane band"]:
         """Ĝ."""
@@ -166,7 +169,7 @@ class Projection:
                 near = v_out[at]
                 at[at] = (near.min(axis=1) <= low) | (near.max(axis=1) >= high)
         variance = self.samples * np.concatenate(squares) / self.freedom()
-        return Seen(np.concatenate(found), np.maximum(variance, self.floor), at)
+        return Seen(np.concatenate(found), np.maximum(variance, self.floor), at, np.zeros_like(at))
 
     def _condensed(
         self, samples: Float[np.ndarray, "lane sample"]

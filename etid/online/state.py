@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -16,6 +17,7 @@ from etid.estimators.score_tests.other_circuit import MOVED, SPREAD
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.alarms import SEEN_IN_PULSES, score_of
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
+from etid.online.repeats import Windows
 from etid.precision import Module
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
@@ -29,8 +31,8 @@ OPEN = 0.99  # effective gain above which an electrode touches nothing
 SHORTED = 0.02  # effective gain below which an electrode is shorted
 DRY = 700e3  # [Ω] at the lowest frequency; the driest fingertip of the paper's Table II has 686 kΩ
 RECENT = 60  # pulses for which an electrode that has drifted is called drifting
-NONE, JUMP, DRIFT = range(3)
-KINDS = ("none", "jump", "drift")
+NONE, JUMP, DRIFT, REPEATED = range(4)
+KINDS = ("none", "jump", "drift", "repeated")
 
 register_description(
     METHOD,
@@ -78,7 +80,7 @@ class ElectrodeState(Module):
         amplitude: Amplitude of the last pulse, relative to that of the unloaded record;
             NaN before the first pulse.
         offset: Offset of the converter [V].
-        shown: A number that two different windows never share, of the last windows.
+        repeated: Whether the last window was an old one (`etid.online.repeats`).
         confirmed: Largest amplitude of a pulse that fitted its prediction, since the last pulse
             that did not; 0 if there was none.
         scores: Sums of the tests of a gain and of a spread since the electrode began anew,
@@ -91,7 +93,8 @@ class ElectrodeState(Module):
         result: Verdict on the last pulse.
         mean: Moving mean of the innovations, m in `etid.online.alarms`.
         mean_cov: Covariance of `mean`.
-        event: Change found by the last pulse: 0 for none, 1 for a jump, 2 for a drift.
+        event: What the last pulse has shown: 0 for nothing, 1 for a jump, 2 for a drift, 3 for old
+            windows that begin.
         factor: Logarithms of new over old elements at the last change.
         element: Number of the element that explains the last change best.
         drifted: Number of the pulse at which the last drift was found; −1 for none.
@@ -103,7 +106,7 @@ class ElectrodeState(Module):
     missed: Int[Array, "*lane"]
     amplitude: Float[Array, "*lane"]
     offset: Float[Array, "*lane"]
-    shown: Float[Array, "*lane window"]
+    repeated: Bool[Array, "*lane"]
     confirmed: Float[Array, "*lane"]
     scores: Float[Array, "*lane change 3"]
     shape: Float[Array, "*lane element element"]
@@ -125,15 +128,17 @@ class TrackerState(Overviewed, Module):
 
     Attributes:
         electrodes: Estimates of all electrodes.
-        number: Number of pulses since the start.
+        number: Number of pulses since the start of the stream.
         driver_event: Whether the last pulse showed a change of the driver.
         driver_changed: Whether any pulse since the start did.
+        windows: The windows since the start; states of one stream share them.
     """
 
     electrodes: ElectrodeState
     number: Int[Array, ""]
     driver_event: Bool[Array, ""]
     driver_changed: Bool[Array, ""]
+    windows: Windows = eqx.field(static=True)
 
     def _overview(self) -> Overview:
         lanes = self.electrodes
@@ -207,10 +212,11 @@ class Change:
 
     Attributes:
         pulse: Number of the pulse since the start, from 1 on.
-        electrode: Number of the electrode; None if the driver has changed.
-        kind: `jump`, `drift`, or `driver`.
-        element: Name of the element that explains the change best; empty for the driver.
-        factor: New value of this element divided by the old one; NaN for the driver.
+        electrode: Number of the electrode; None for the driver, and for more than half of the
+            electrodes whose windows begin to repeat together.
+        kind: `jump`, `drift`, `driver`, or `repeated`.
+        element: Name of the element that explains a jump or a drift best; otherwise empty.
+        factor: New value of this element divided by the old one; otherwise NaN.
     """
 
     pulse: int
@@ -220,10 +226,23 @@ class Change:
     factor: float
 
     def __str__(self) -> str:
-        if self.electrode is None:
-            return f"pulse {self.pulse}: the driver has changed"
-        by = f"{self.element} is {rounded(self.factor, 3)} times what it was"
-        return f"pulse {self.pulse}, electrode {self.electrode}: {self.kind}, {by}"
+        return f"pulse {self.pulse}: {self.words(f'electrode {self.electrode}')}"
+
+    def words(self, name: str) -> str:
+        """What has happened, with cause and remedy.
+
+        Args:
+            name: Name of the electrode.
+        """
+        if self.kind == "driver":
+            return "the driver has changed; calibrate again"
+        if self.kind == "repeated":
+            where = f"at {name}" if self.electrode is not None else "at most electrodes"
+            return (
+                f"old windows return {where}: the converter's buffer is not filled anew. Amplitude "
+                "0 until the noise is new. Check the acquisition"
+            )
+        return f"{self.kind} of {self.element}, to {self.factor:.2g} times its value, at {name}"
 
 
 def changes(state: TrackerState, names: tuple[str, ...]) -> list[Change]:
@@ -232,7 +251,7 @@ def changes(state: TrackerState, names: tuple[str, ...]) -> list[Change]:
     if state.driver_event:
         return [Change(number, None, "driver", "", math.nan)]
     event, element, factor = map(np.asarray, (lanes.event, lanes.element, lanes.factor))
-    return [
+    found = [
         Change(
             number,
             int(at),
@@ -240,8 +259,12 @@ def changes(state: TrackerState, names: tuple[str, ...]) -> list[Change]:
             names[element[at]],
             float(np.exp(factor[at, element[at]])),
         )
-        for at in np.flatnonzero(event != NONE)
+        for at in np.flatnonzero((event == JUMP) | (event == DRIFT))
     ]
+    old: list[int | None] = [*np.flatnonzero(event == REPEATED).tolist()]
+    if len(old) > max(event.size / 2, 1):
+        old = [None]
+    return found + [Change(number, at, KINDS[REPEATED], "", math.nan) for at in old]
 
 
 def bad_electrodes(state: TrackerState, impedance: Float[np.ndarray, " lane"]) -> dict[int, str]:

@@ -28,7 +28,7 @@ from etid.online.pulse_fit import (
     nearest_delay,
     searched,
 )
-from etid.online.state import DRIFT, JUMP, NONE, OPEN, ElectrodeState, TrackerState
+from etid.online.state import DRIFT, JUMP, NONE, OPEN, REPEATED, ElectrodeState
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.transfer import as_complex, power
 from etid.solvers.matrices import inverse_of_few, root_of_few
@@ -48,7 +48,7 @@ class Measured(NamedTuple):
         amplitude: Amplitude of the pulse, relative to that of the unloaded record.
         offset: Offset of the converter [V].
         steady: Whether the amplitude is nearly that of the pulse before.
-        shown: A number that two different windows never share.
+        repeated: Whether the window is an old one.
         bad: Verdict on the samples.
     """
 
@@ -59,7 +59,7 @@ class Measured(NamedTuple):
     amplitude: Float[Array, "*lane"]
     offset: Float[Array, "*lane"]
     steady: Bool[Array, "*lane"]
-    shown: Float[Array, "*lane"]
+    repeated: Bool[Array, "*lane"]
     bad: RESULTS
 
 
@@ -112,21 +112,25 @@ def updated(
     model: GainModel,
     change: Float[Array, ""],
     limit: Float[Array, ""],
-    state: TrackerState,
+    before: ElectrodeState,
+    number: Int[Array, ""],
+    driver_changed: Bool[Array, ""],
     seen: Seen,
     amplitude: Float[Array, " lane"],
-) -> TrackerState:
-    """The state after one more pulse.
+) -> tuple[ElectrodeState, Int[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    """The fields of `TrackerState` after one more pulse, without its windows.
 
     Args:
         model: Model of the gain.
         change: Standard deviation of the random walk [1/√pulse].
         limit: Limit of the tests for a change.
-        state: State before the pulse.
-        seen: The bands of the windows.
+        before: Estimates before the pulse.
+        number: Number of the pulse before.
+        driver_changed: Whether any pulse before showed a change of the driver.
+        seen: What the windows show.
         amplitude: Relative amplitude of the pulse.
     """
-    before, number = state.electrodes, state.number + 1
+    number = number + 1
     powers = model.circuit.scaling()[0]  # also how a change of Z_th moves the elements
     measured = measured_pulse(model.bands, seen, amplitude, before)
     information = jax.vmap(lambda of: predicted(of, change))(before.information)
@@ -163,7 +167,7 @@ def updated(
     )
     counts = running & measured.steady & (measured.bad == SUCCESSFUL)
     event = driver_change(suspected.jump, suspected.z.T, counts, running)
-    return TrackerState(after, number, event, state.driver_changed | event)
+    return after, number, event, driver_changed | event
 
 
 def _expected(
@@ -203,8 +207,6 @@ def measured_pulse(
     noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * variance
     flat = (signal < 4 * noise) | ~(amplitude > 0)
     level = jnp.sqrt(jnp.maximum(signal - noise, 0.0) / jnp.sum(bands.weight)) / relative
-    shown = power(seen.gain()) @ bands.weight  # of the samples alone
-    repeated = jnp.any(shown[:, None] == before.shown, axis=1)
     bad = jax.vmap(
         lambda finite, clipped, unknown, flat, repeated, unconnected: first_verdict(
             (~finite, RESULTS.nonfinite_samples),
@@ -214,7 +216,7 @@ def measured_pulse(
             (repeated, RESULTS.repeated),
             (unconnected, RESULTS.unconnected),
         )
-    )(finite, seen.clipped, unknown, flat, repeated, jnp.abs(level - 1) < 1 - OPEN)
+    )(finite, seen.clipped, unknown, flat, seen.repeated, jnp.abs(level - 1) < 1 - OPEN)
     return Measured(
         gain=gain * as_complex(1 / relative)[:, None],
         variance=variance / relative**2,
@@ -223,7 +225,7 @@ def measured_pulse(
         amplitude=amplitude,
         offset=offset,
         steady=steady,
-        shown=shown,
+        repeated=jnp.asarray(seen.repeated),
         bad=bad,
     )
 
@@ -373,7 +375,8 @@ def after_pulse(
     moved = Innovation.of(factor, used.spread, information)
     jumped = suspected.jump & good & (moved.statistic() > limit)
     drifted = suspected.drift & good & ~jumped
-    event = jnp.where(jumped, JUMP, jnp.where(drifted, DRIFT, NONE)).astype(int)
+    old = measured.repeated & ~state.repeated
+    event = jnp.where(jumped, JUMP, jnp.where(drifted, DRIFT, jnp.where(old, REPEATED, NONE)))
     changed = jumped | drifted
 
     silent = measured.amplitude == 0
@@ -398,7 +401,7 @@ def after_pulse(
         missed=missed,
         amplitude=measured.amplitude,
         offset=measured.offset,
-        shown=jnp.append(measured.shown, state.shown[:-1]),
+        repeated=measured.repeated,
         confirmed=jnp.where(fits, reached, jnp.where(silent, state.confirmed, 0.0)),
         scores=sums,
         shape=jnp.where(good, shape, state.shape),
@@ -411,7 +414,7 @@ def after_pulse(
         ),
         mean=jnp.where(followed, suspected.mean, jnp.where(ended, 0.0, state.mean)),
         mean_cov=jnp.where(followed, suspected.mean_cov, jnp.where(ended, 0.0, state.mean_cov)),
-        event=event,
+        event=event.astype(int),
         factor=jnp.where(changed, factor, state.factor),
         element=jnp.where(
             jumped, moved.element(), jnp.where(drifted, suspected.element, state.element)

@@ -45,7 +45,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
@@ -59,6 +59,7 @@ from etid.online.alarms import limit
 from etid.online.gain_bands import cut, unloaded_bands
 from etid.online.projection import Projection
 from etid.online.pulse_fit import GainModel
+from etid.online.repeats import Windows
 from etid.online.state import (
     Change,
     ElectrodeState,
@@ -78,7 +79,6 @@ from etid.results.fits import Fits
 from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
 
-BUFFERS = 8  # windows that are remembered: a source with more buffers may return an old one unseen
 # A window has faults that a record of several periods has not, and others have other remedies.
 NOTES = {
     "too_short": "No pulse was identified yet; the elements are typical values, not estimates.",
@@ -202,13 +202,19 @@ class Tracker(Overviewed, Kept):
         return Overview(f"Tracker of {kind}, driver {of_driver}", rows)
 
     @in_float64
-    def start(self, *, at_rest: bool = False) -> TrackerState:
+    def start(self, *, at_rest: bool = False, after: TrackerState | None = None) -> TrackerState:
         """The state before the first pulse, without information.
 
         Args:
             at_rest: Whether there was no pulse before the first one. Otherwise that pulse had the
                 amplitude of the first one. A display at rest is identified from the second pulse
                 on, whose amplitude should be that of the first one.
+            after: The last state, if the stream goes on and only the estimates begin anew. Its
+                windows remain known, so that a converter that returns them is noticed.
+
+        Raises:
+            RecordingError: `after` is no state of a tracker.
+            ValueError: `after` is the state of another tracker.
         """
         lanes, elements = self.electrodes, len(self.model.circuit.names())
         typical = jnp.append(self.model.circuit.log_values(), 0.0)
@@ -220,7 +226,7 @@ class Tracker(Overviewed, Kept):
             missed=none,
             amplitude=jnp.zeros(lanes) if at_rest else nan,
             offset=nan,
-            shown=jnp.full((lanes, BUFFERS), jnp.nan),
+            repeated=jnp.zeros(lanes, bool),
             scores=jnp.zeros((lanes, 2, 3)),
             shape=jnp.zeros((lanes, elements, elements)),
             confirmed=jnp.zeros(lanes),
@@ -237,7 +243,13 @@ class Tracker(Overviewed, Kept):
             drifted=none - 1,
         )
         no = jnp.asarray(False)
-        state = TrackerState(electrodes, jnp.zeros((), int), no, no)
+        if after is None:
+            windows = Windows.of(self.projection.runs, self.projection.block, lanes)
+            number = jnp.zeros((), int)
+        else:
+            self.check(after)
+            windows, number = after.windows, after.number
+        state = TrackerState(electrodes, number, no, no, windows)
         # Types and device of a state that `update` returns: with others, it would compile twice.
         state = jax.tree.map(lambda leaf: leaf.astype(leaf.dtype), state)
         return jax.device_put(state, self.model.source.sharding)
@@ -287,7 +299,7 @@ class Tracker(Overviewed, Kept):
                 that of the unloaded record. An electrode without a pulse has 0; its state remains.
 
         Returns:
-            State after this pulse.
+            State after this pulse. Its windows are those of `state` and this one.
 
         Raises:
             RecordingError: `state` is no state of a tracker, or `v_out` holds no real numbers, or
@@ -311,8 +323,14 @@ class Tracker(Overviewed, Kept):
                 remedy="Multiply converter codes by volts per code; convert voltages to floats",
             )
         relative = for_each("amplitude", amplitude, self.electrodes)
-        found = self.projection.seen(v_out.astype(float, copy=False), self.adc_range)
-        return updated(self.model, self.change, self.limit, state, found, relative)
+        old = state.windows.repeated(v_out, int(state.number) + 1)
+        seen = self.projection.seen(v_out.astype(float, copy=False), self.adc_range)
+        seen = seen._replace(repeated=old)
+        before, number, changed = state.electrodes, state.number, state.driver_changed
+        electrodes, number, event, changed = updated(
+            self.model, self.change, self.limit, before, number, changed, seen, relative
+        )
+        return TrackerState(electrodes, number, event, changed, state.windows)
 
     @in_float64
     def read(self, state: TrackerState) -> Fits:
@@ -332,7 +350,7 @@ class Tracker(Overviewed, Kept):
             RecordingError: `state` is no state of a tracker.
         """
         self.check(state)
-        found = _judged(self.model, self.driver_result, state)
+        found = _judged(self.model, self.driver_result, state.electrodes, state.driver_changed)
         fit = jax.tree.map(np.asarray, found)
         electrodes = [
             {"path": f"electrode/{number}", "electrode": str(number)}
@@ -385,10 +403,13 @@ def for_each(name: str, given: Any, electrodes: int) -> Float[np.ndarray, " lane
 
 
 @program
-def _judged(model: GainModel, driver_result: RESULTS, state: TrackerState) -> Fit:
-    return jax.vmap(lambda of: fit_of(model, driver_result, state.driver_changed, of))(
-        state.electrodes
-    )
+def _judged(
+    model: GainModel,
+    driver_result: RESULTS,
+    electrodes: ElectrodeState,
+    driver_changed: Bool[Array, ""],
+) -> Fit:
+    return jax.vmap(lambda of: fit_of(model, driver_result, driver_changed, of))(electrodes)
 
 
 @jax.jit  # as `etid.online.tick.updated`

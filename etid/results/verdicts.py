@@ -94,8 +94,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
     repeated = (
-        "The samples are exactly those of one of the last eight pulses. Noise never repeats, so "
-        "this buffer was not filled anew. Check the acquisition."
+        "The noise is exactly that of an earlier pulse. Noise never repeats, so this buffer was "
+        "not filled anew. Check the acquisition."
     )
     saturated = (
         "The converter clipped. Lower the gain or the stimulus and record again. If nothing "
