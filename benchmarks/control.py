@@ -67,8 +67,8 @@ OPTIONS = (
     option("--electrodes", default=98),
     option("--pulses", default=120),
     option("--snr", default=(60.0, 40.0), help="dB"),
-    option("--hazard-electrodes", default=96),
-    option("--hazard-pulses", default=5210),
+    option("--hazard-electrodes", default=114),
+    option("--hazard-pulses", default=4400),
     option("-o", "--output", default=RESULTS / "control", help="of the .csv and the .svg"),
 )
 

@@ -3,6 +3,10 @@
 The loads change at random, between a short circuit, resistors, skin of all kinds, and no contact
 (`benchmarks.control_plant`). In most cells the records are wrong as well, each for some pulses.
 
+In the cells of `RINGS` a ring buffer of the whole cell is not filled any more for some time, and
+returns its last samples again and again. Half of these times all electrodes become wet a few pulses
+after it began.
+
 A pulse is **above the cap** if its charge exceeds the cap. It follows an **unseen change** if the
 load changed just before it, and the load before would have had no more than the cap: no record
 could show the change. Behind two swapped channels, the electrode's own channel shows the change one
@@ -11,6 +15,7 @@ above the worst case that the command states.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,12 +34,22 @@ WANTED = 80e-9  # [C]
 CHANGE = 6e-3  # random walk that the tracker expects, as in `benchmarks.control`
 EVERY = 30  # pulses between two changes of a load, on the average
 TROUBLE, LASTS = 60, 10  # pulses between two faults, and of one fault, on the average
+PERIOD = 200e3 / 60  # [samples]
 SHORT, OPEN, FIRST, PATH = 0, 1, 2, 40  # numbers of loads; steps from dry to very wet skin
 FACTORS = np.array([0.5, 0.8, 0.9, 1.1, 1.25, 2.0])  # of a wrong amplitude
+# Length of a ring buffer [pulse periods]. Those of 9 and 12 are whole samples, so that windows come
+# back as they were; others come back some samples beside their place, the last one by a third.
+RINGS = {
+    **{f"ring of {length} windows": float(length) for length in (1, 9, 12, 20, 50)},
+    "ring of 20 windows and two samples": 20 + 2 / 3333,
+    "ring of 20 windows and a third": 20 + 1 / 3,
+}
+WET = FIRST + PATH - 1  # number of the wettest skin of the path
 CELLS = (
     *("constant", "steps", "wetting", "contact", "more than the cap wanted"),
     *("clipped, range known", "clipped, range unknown", "frozen", "swapped", "not a number"),
     *("wrong amplitude", "amplitude of the pulse before"),
+    *RINGS,
 )
 
 
@@ -84,8 +99,22 @@ class Cell:
             self.load = FIRST + np.clip(np.abs(walk % (2 * PATH) - PATH), 0, PATH - 1)
         if name == "contact":
             self.load = np.where(fault, OPEN, self.load)
+        if name in RINGS:
+            fault = self._rings(max(pulses // 10, 1))
         self.fault: Bool[np.ndarray, "pulse lane"] = fault
         self.older: list[np.ndarray] = []
+        self.ended = 0  # first sample that a ring buffer did not get
+
+    def _rings(self, longest: int) -> Bool[np.ndarray, "pulse lane"]:
+        """Pulses at which the ring buffer is not filled; some of these times the skin gets wet."""
+        length, fault = math.ceil(RINGS[self.name]), np.zeros(self.load.shape, bool)
+        end = 0
+        while (begin := end + length + 1 + self.rng.geometric(1 / EVERY)) < len(fault):
+            end = begin + min(2 * length + self.rng.geometric(1 / LASTS), longest)
+            fault[begin:end] = True
+            if self.rng.random() < 0.5:
+                self.load[begin + self.rng.integers(4) : end + EVERY] = WET
+        return fault
 
     def told(
         self,
@@ -114,8 +143,27 @@ class Cell:
             told[bad] *= FACTORS[bad % FACTORS.size]
         if self.name == "amplitude of the pulse before":
             told[bad] = amplitude[1, bad]
+        if self.name in RINGS:
+            return self._old(number, v), told
         self.older = [v, *self.older[:1]]
         return v, told
+
+    def _old(
+        self, number: int, v: Float[np.ndarray, "lane sample"]
+    ) -> Float[np.ndarray, "lane sample"]:
+        """What a ring buffer returns at this pulse: its own samples while it is not filled."""
+        length, begin = round(RINGS[self.name] * PERIOD), round(number * PERIOD)
+        if not self.fault[number, 0]:
+            # Between two windows there may be one more sample, which no window has.
+            more = round((number + 1) * PERIOD) - begin - v.shape[1]
+            new = np.concatenate([v, v[:, v.shape[1] - more :]], axis=1)
+            self.older = [*self.older, new][-math.ceil(RINGS[self.name]) - 1 :]
+            return v
+        if not self.fault[number - 1, 0]:
+            self.older = [np.concatenate(self.older, axis=1)[:, -length:]]
+            self.ended = begin
+        [ring] = self.older
+        return ring[:, (begin - self.ended + np.arange(v.shape[1])) % length]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +179,10 @@ class Given:
 
     def row(self, snr: float, cell: str) -> dict[str, Any]:
         """What the cell shows, as a row of the table."""
-        above, reasons = self.charge > CAP, ("wanted", "charge", "confirmed", "fallback")
+        above, reasons = (
+            self.charge > CAP,
+            ("wanted", "charge", "confirmed", "fallback", "repeated"),
+        )
         # No record could show the change.
         seen = np.minimum(self.before, self.earlier) if cell == "swapped" else self.before
         unseen = above & (seen <= CAP)

@@ -164,7 +164,7 @@ def closed_loop(
         state = tracker.update(state, v, given)
         if state.driver_changed:
             print(f"a change of the driver was reported at pulse {number}")
-            state = tracker.start()
+            state = tracker.start(after=state)
 
 
 # What happens to the skin at an electrode.
