@@ -72,15 +72,21 @@ def errors(fits):
 CASES = {}
 
 
+def counted(fits):
+    """How often each verdict occurs."""
+    return ", ".join(f"{count} {verdict}" for verdict, count in fits.counts().items())
+
+
 def tell(name, fits):
     """Keep a case; print its verdicts, its errors and its standard errors."""
     CASES[name] = fits
     mean, stderr = 100 * errors(fits).mean(axis=0), 100 * np.asarray(fits.stderr.values()) / TRUTH
     said = np.nanmedian(stderr, axis=0) if np.isfinite(stderr).any() else np.full(3, np.nan)
-    print(f"{name}: {', '.join(f'{count} {verdict}' for verdict, count in fits.counts().items())}")
+    print(f"{name}: {counted(fits)}")
     print(f"  RRSE {100 * np.median(fits.fit.rrse):.2f} %, chi2 {np.median(fits.fit.chi2):.2f}")
     for element, m, s in zip(fits.circuit.names(), mean, said, strict=True):
-        print(f"  {element}: mean error {m:+6.1f} %, standard error {s:.1f} %")
+        known = f"standard error {s:.1f} %" if np.isfinite(s) else "no standard error"
+        print(f"  {element}: mean error {m:+6.1f} %, {known}")
 
 
 fits, driver, study = identified(good)
@@ -122,7 +128,7 @@ for name, some in (("default", late_fits), ("Steiglitz-McBride", late_paper)):
 # %%
 narrow = dataclasses.replace(good, full_scale=2.4)
 clipped = etid.identify_skins(narrow.simulate(SEED).loaded, driver)
-print(clipped.counts())
+print(f"clipped: {counted(clipped)}")
 print(clipped.notes[0])
 
 # %%
@@ -178,13 +184,14 @@ tell("order 3", low_fits)
 
 # %% [markdown]
 # ## 7. Too little in the record
-# At 10 dB the record does not determine R_s. The standard error is as large as the value, so the
-# verdict is not a success. The bound predicts this before the recording.
+# At 10 dB the record does not determine R_s: its standard error is as large as its value. The bound
+# predicts this before the recording. Most fits are `insensitive`. In some records the noise hides
+# even where the edges are (`misaligned`), or the minimum (`max_steps_reached`). None is a success.
 
 # %%
 poor = dataclasses.replace(good, snr_db=10.0)
 poor_fits, *_ = identified(poor)
-print(poor_fits.counts())
+print(f"10 dB: {counted(poor_fits)}")
 print(etid.bound(poor)["damp/00"])
 
 # %% [markdown]

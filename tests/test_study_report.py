@@ -132,7 +132,7 @@ def test_names_and_notes_of_a_file_are_text_and_nothing_else(page, found):
 
 def test_worst_fits_are_drawn_with_what_was_measured(page):
     text = _Read(page).text
-    assert "loaded/4: misfit (without success). χ² 7.04, r_s 43.4" in text
+    assert "loaded/4: misfit (without success). χ² 7.04, R_s 43.4" in text
     assert f"{PATHS[5]}: flat (without success). No prediction: no circuit was identified." in text
     assert "loaded/3: successful (largest χ² among the successful)" in text
     assert "loaded/0: successful (largest standard error among the successful)" in text

@@ -116,9 +116,10 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
     axes[-1].set_xlabel(by[0])
     _legend(axes, list(map(plain, series)), "" if good.all() else "without success")
-    lines = [f"{several(len(fits), 'fit')}: {counted(fits.verdicts)}; bars: one standard error"]
+    bars = "bars: one standard error"
     if summary:
-        lines.append("thick: medians, and the variation between fits beyond their errors")
+        bars += "; thick: medians, and the variation between fits beyond their errors"
+    lines = [f"{several(len(fits), 'fit')}: {counted(fits.verdicts)}", bars]
     if beside_points:
         lines.append(f"beside the points: {beside_points}")
     if pooled := fits.pooled(*by):

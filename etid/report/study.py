@@ -169,14 +169,18 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
         return Section("Elements", warning="No fit is successful: there is nothing to average.")
     units = fits.circuit.units()
     text = (
-        "Variations and errors, separated. Between subjects: standard deviation of the medians of "
-        "the subjects, of the median of this table. The others are of the median of each subject, "
-        "and the median over subjects. Between recordings: variation between the recordings of one "
-        "subject in one condition without the noise, sqrt(spread² - own²); 0 if noise explains all "
-        "of the spread. Own error: standard error from the noise of one recording. "
-        "Shared error: standard error from the driver. All recordings with that driver share it: "
-        "the spread does not show it, and more trials do not reduce it. A cell is empty if the "
-        "study cannot determine the number."
+        "How large each element is, how much it varies, and how well one fit knows it. The last "
+        "four columns are in per cent of the median:\n\n"
+        "Between subjects: how much the subjects differ, the standard deviation of their "
+        "medians.\n\n"
+        "Between recordings: how much the recordings of one subject differ beyond the noise, "
+        "sqrt(spread² - own²); 0 if noise explains all of the spread.\n\n"
+        "Own error: the standard error of one fit from the noise of its recording. A mean of more "
+        "recordings has less of it.\n\n"
+        "Shared error: the standard error of one fit from the driver. All recordings with that "
+        "driver share it: their spread does not show it, and more recordings do not reduce it.\n\n"
+        "The last three are medians over the subjects. A cell is empty if the study cannot "
+        "determine the number."
     )
     text += _pooled(fits)
     conditions = len(set(map(str, fits.labels["condition"])))

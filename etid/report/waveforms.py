@@ -7,7 +7,7 @@ import pathlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from etid.circuits.display import significant
+from etid.circuits.display import as_symbol, significant
 from etid.plotting import figure_of
 from etid.plotting.style import svg
 from etid.recordings.hdf5 import read
@@ -81,7 +81,8 @@ def picture(found: StudyFits, study: Study, row: int, reason: str) -> Picture | 
     by_current = found.by_current or recording.cause == "current"
     driver = None if by_current else found.drivers.get(calibrations_of(found, study, recording))
     figure, why = _predicted(recording, fit, driver, by_current=by_current)
-    elements = ", ".join(fit.elements)
+    named = (one.partition(" ") for one in fit.elements)
+    elements = ", ".join(f"{as_symbol(name)} {value}" for name, _, value in named)
     about = f"{path}: {fit.verdict}{f' ({reason})' if reason else ''}."
     alt = f"One pulse of {path}: measured, predicted and residual voltage. {elements}"
     caption = f"{about} χ² {significant(float(fit.chi2), 3)}, {elements}."
