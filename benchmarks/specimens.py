@@ -261,6 +261,9 @@ def _matlab73(folder: pathlib.Path) -> bytes:
             file[name] = np.atleast_2d(values).T
             file[name].attrs["MATLAB_class"] = np.bytes_("double")
         file.create_group("about")["rate"] = np.array([[2e5]])
+        file["#refs#/0"], file["#refs#/1"] = _numbers()
+        file["cells"] = np.array([[file["#refs#/0"].ref], [file["#refs#/1"].ref]], h5py.ref_dtype)
+        file["cells"].attrs["MATLAB_class"] = np.bytes_("cell")
     with path.open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     return path.read_bytes()
@@ -271,7 +274,9 @@ def _matlab5(_: pathlib.Path) -> bytes:
 
     buffer = io.BytesIO()
     open_, skin = _numbers()
-    scipy.io.savemat(buffer, {"open": open_, "skin": skin, "about": {"rate": 2e5}})
+    cells = np.array([open_, {"skin": skin}], object)
+    content = {"open": open_, "skin": skin, "about": {"rate": 2e5}, "cells": cells}
+    scipy.io.savemat(buffer, content)
     return buffer.getvalue()
 
 

@@ -287,3 +287,18 @@ def test_a_single_file_does_not_fill_in_labels(apart, tmp_path):
     for v_th, remedy in (("open_{trial}.csv:CH1", "for a folder, with --labels"), ("a.csv:b", "")):
         with pytest.raises(RecordingError, match=rf"there is no file .* current folder.*{remedy}"):
             import_file(apart / "skin_1.csv", tmp_path / "study.h5", v_th=v_th, **ONE)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ([], "is a folder; a pattern must say what the names of its files mean. Name their labels"),
+        (
+            ["--labels", "{trial}.csv", "--calibration", "a.csv", "98k8"],
+            "a folder is imported alone",
+        ),
+    ],
+)
+def test_the_command_says_what_a_folder_needs(more, message, folder, tmp_path, capsys):
+    assert main(["import", str(folder), "-o", str(tmp_path / "a.h5"), *more]) == 1
+    assert message in capsys.readouterr().err

@@ -131,11 +131,18 @@ def run(arguments: argparse.Namespace) -> Outcome:
 def _folder(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Outcome:
     """Import a folder, and return what became of each file."""
     folder, *more = arguments.source
-    if not arguments.labels or more or arguments.calibrations or arguments.mapping:
+    if not arguments.labels:
+        raise RecordingError(
+            "is a folder; a pattern must say what the names of its files mean",
+            file=str(folder),
+            remedy="Name their labels, as in --labels '{subject}_{trial}.csv', and for files of "
+            "known resistors --labels 'cal_{r_load}.csv'",
+        )
+    if more or arguments.calibrations or arguments.mapping:
         raise RecordingError(
             "a folder is imported alone, with --labels in place of --calibration and --mapping",
             file=str(folder),
-            remedy="Name the labels of its files, as in --labels '{subject}_{trial}.csv'",
+            remedy="Leave out the others; a pattern such as 'cal_{r_load}.csv' names resistors",
         )
     found = import_folder(folder, arguments.target, arguments.labels, **given)
     data = {
