@@ -1,6 +1,7 @@
 """Arrays of structures, cells and matrices of channels in MATLAB files, under MATLAB's names."""
 
 import pathlib
+from typing import Any
 
 import h5py
 import numpy as np
@@ -13,7 +14,7 @@ from tests.lab_files import imported, refused
 from tests.lab_files import matlab as plain
 
 TH = np.arange(30.0)
-FIELDS = {"sample_rate": 2e5, "pulse_rate": 60.0, "scale": 1.0}
+FIELDS: dict[str, Any] = {"sample_rate": 2e5, "pulse_rate": 60.0, "scale": 1.0}
 
 
 def written(path, version):
@@ -113,9 +114,9 @@ def test_a_channel_of_a_matrix_may_be_in_another_file(tmp_path, monkeypatch):
 def test_cells_that_lead_in_a_circle_end(tmp_path):
     path = plain(tmp_path / "a.mat", 7.3, m=TH)
     with h5py.File(path, "r+") as file:
-        file.create_dataset("loop", (1, 1), h5py.ref_dtype)
-        file["loop"].attrs["MATLAB_class"] = np.bytes_("cell")
-        file["loop"][0, 0] = file["loop"].ref
+        loop = file.create_dataset("loop", (1, 1), h5py.ref_dtype)
+        loop.attrs["MATLAB_class"] = np.bytes_("cell")
+        loop[0, 0] = loop.ref
     with matlab.opened(path, tmp_path) as contents:
         assert contents.names == ("m",)
 

@@ -4,11 +4,12 @@ import pathlib
 import re
 import subprocess
 import sys
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from h5py import h5d, h5p, h5s, h5t, h5z
+from h5py import h5d, h5p, h5s, h5t, h5z  # type: ignore[attr-defined]  # without stubs
 
 import etid
 from benchmarks.specimens import study_fits
@@ -115,7 +116,8 @@ def test_hdf5plugin_is_used_where_it_is_installed(filtered, tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
     del sys.modules["hdf5plugin"]  # and it is put back at the end
     monkeypatch.setattr(untrusted.h5z, "filter_avail", lambda code: "hdf5plugin" in sys.modules)
-    with untrusted.guarded(str(filtered)) as file:
+    with untrusted.guarded(str(filtered)) as opened:
+        file: Any = opened
         untrusted.check_size(file["loaded/0/v_th"])
         assert "hdf5plugin" not in sys.modules  # only for a filter that is needed
         untrusted.check_size(file["loaded/0/v_out"])
