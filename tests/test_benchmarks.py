@@ -44,7 +44,7 @@ CASES = {
     "curves": ("--quick --folder {}", "curves.csv curves.svg", "LM fit, optimistix"),
     "delays": ("--scatter 3e-9 --snr-db 60", "", "3 ns: 64, 64, 82, dropped"),
     "design": ("", "", "times better than 60 Hz"),
-    "driver_order": ("--drivers 1 --snr-db 60 --orders 4 5 --data {}", "", "100 % right"),
+    "driver_order": ("--drivers 1 --snr-db 60 --orders 5 7 --data {}", "", "100 % right"),
     "fuzz": ("--files 3 --kind csv --output {}/f.json", "f.json", "0 faults in 3 files"),
     "live": (
         "--electrodes 4 --minutes 0.02 --output {}/live.csv", "live.csv",

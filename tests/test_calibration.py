@@ -8,8 +8,7 @@ import pytest
 import etid
 from etid.cli import main
 from etid.commands import calibrate as command
-from etid.simulation import calibration
-from etid.simulation.calibration import MORE, NOW
+from etid.simulation.calibration import MORE, MOST, NOW
 from etid.simulation.scenes import Trial
 from etid.simulation.transformer import ResistorLoad
 
@@ -25,15 +24,7 @@ def study(scene):
 
 
 @pytest.fixture(scope="module")
-def without_further():
-    """Another resistor is not tried."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calibration, "_with_resistor", lambda *_: None)
-        yield
-
-
-@pytest.fixture(scope="module")
-def today(study, without_further):
+def today(study):
     return etid.calibrate(study["calibration/98k8"])
 
 
@@ -59,8 +50,9 @@ def test_expected_errors_are_those_of_recordings_of_skin(today, skin):
     found = stderrs(etid.identify_skin(study[f"typical/{skin}/02"], today.driver))
     # The noise of each record is estimated to 5 %, and that of the calibration is in both.
     assert today.expected[skin][NOW] == pytest.approx(found, rel=0.15)
+    # Half as large, but for what the weak prior of Z_th already tells at this noise.
     half = {name: error / 2 for name, error in today.expected[skin][NOW].items()}
-    assert today.expected[skin][MORE] == pytest.approx(half)
+    assert today.expected[skin][MORE] == pytest.approx(half, rel=0.05)
 
 
 def test_the_same_driver_on_another_day_has_not_moved_and_a_wrong_resistor_is_named(scene, today):
@@ -87,14 +79,21 @@ def test_skin_in_place_of_the_resistor_is_no_other_resistor(scene, today):
 def test_the_line_on_what_helps_is_that_of_the_least_known_element(today):
     names = "r_s", "r_p", "c_p"
     known = {"dry": {NOW: (0.02, 0.001, 0.001), MORE: (0.01, 5e-4, 5e-4)}}
-    known["damp"] = {NOW: (0.031, 0.01, 0.01), "also with 10 kΩ": (0.008, 0.009, 0.01)}
+    known["damp"] = {
+        NOW: (0.031, 0.01, 0.01),
+        MORE: (0.0155, 5e-3, 5e-3),
+        "also with 10 kΩ": (0.008, 0.009, 0.01),
+    }
     by_skin = {
         skin: {what: dict(zip(names, errors, strict=True)) for what, errors in by.items()}
         for skin, by in known.items()
     }
-    text = str(dataclasses.replace(today, expected=by_skin))
-    assert "r_s of damp skin is least known; also with 10 kΩ helps most: 0.8 %" in text
-    assert "1 % takes 10 times as many periods" in text  # (0.031 / 0.01)² = 9.6
+    text = str(dataclasses.replace(today, expected=by_skin, times=9.6))
+    words = "least known is r_s of damp skin, ± 3.1 %; what helps most: also with 10 kΩ, ± 0.8 %"
+    assert words in text
+    assert "1 % takes 10 times as many periods" in text
+    text = str(dataclasses.replace(today, expected=by_skin, times=np.inf))
+    assert f"not even {MOST:g} times as many periods make it 1 %" in text
 
 
 def test_the_command_writes_a_driver_and_a_picture(study, today, tmp_path, capsys, monkeypatch):
@@ -109,12 +108,12 @@ def test_the_command_writes_a_driver_and_a_picture(study, today, tmp_path, capsy
 
     monkeypatch.setattr(command, "calibrate", fake)
     assert main(["calibrate", str(source), "-o", str(driver), "--picture", str(picture)]) == 0
-    assert "standard errors to expect of skin" in capsys.readouterr().out
+    assert "standard errors to expect of typical skin" in capsys.readouterr().out
     assert picture.read_text("utf-8").lstrip().startswith("<?xml")
     again = tmp_path / "again.h5"
     command_line = ["calibrate", str(driver), "-o", str(again), "--former", str(driver)]
     assert main([*command_line, "--order", "4"]) == 0
-    assert orders == ["auto", 4]
+    assert orders == [5, 4]
     frequency = np.geomspace(100.0, 80e3, 20)
     assert formers[0] is None
     np.testing.assert_array_equal(formers[1].response(frequency), today.driver.response(frequency))
@@ -193,7 +192,7 @@ def two_named(study):
         (lambda study: [study["calibration/98k8"]], ["--joint"], "remove --driver, or --joint"),
         (
             lambda study: [study["calibration/98k8"]],
-            ["--method", "steiglitz_mcbride"],
+            ["--method", "steiglitz_mcbride", "--order", "auto"],
             "order 'auto' needs maximum likelihood",
         ),
     ],

@@ -8,7 +8,7 @@ from etid.commands.fit import order
 from etid.plotting import figure_of
 from etid.plotting.style import save
 from etid.recordings.replacing import HDF5
-from etid.results.driver import AUTO, Driver
+from etid.results.driver import Driver
 from etid.simulation.calibration import calibrate, calibrations_in, read_driver
 
 
@@ -21,9 +21,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--order",
         type=order,
-        default=AUTO,
-        metavar="NUMBER",
-        help="number of poles of the driver; default auto: the least that the calibrations support",
+        default=5,
+        metavar="N",
+        help="number of poles of the driver, or auto: from 7 on, as the calibrations need it; "
+        "default 5",
     )
     parser.add_argument(
         "--former",

@@ -45,9 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--order",
         type=order,
+        default=5,
         metavar="N",
-        help="number of poles of the driver, or auto: the least that the calibrations support; "
-        "default 5, with --driver auto",
+        help="number of poles of the driver, or auto: from 7 on, as the calibrations need it; "
+        "default 5",
     )
     for option, example, shape, purpose in (
         ("--fix", "r_s=500", "ELEMENT=VALUE", "known value of an element [SI], such as r_s=500"),
@@ -181,7 +182,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             outcome = identify_jointly(
                 study,
                 **options,
-                order=5 if arguments.order is None else arguments.order,
+                order=arguments.order,
                 progress=progress,
             )
             outcome.write(arguments.target)

@@ -58,8 +58,9 @@ def identify_driver(
 
     Args:
         calibrations: Recordings with `r_load`, all of the same length, sample rate and pulse rate.
-        order: Number of poles of Z_th (the paper uses 5), or `"auto"`: the least order that the
-            calibrations support, by maximum likelihood. `driver.tried` holds the evidence.
+        order: Number of poles of Z_th (the paper uses 5), or `"auto"`: from 7 on as many as the
+            calibrations need, by maximum likelihood, so that the standard errors contain poles that
+            the calibrations do not show. `driver.tried` holds the evidence.
         method: `"maximum_likelihood"` (for records of several whole pulse periods),
             `"output_error"`, the paper's `"steiglitz_mcbride"`, or its first iteration,
             `"equation_error"`. An estimator with options is possible too, as in
@@ -130,7 +131,7 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     check_instrument(instrument, estimator)
     arrays = None if instrument is None else instrument.as_arrays()
     if options.order == AUTO:
-        driver = _of_least_order(seen, estimator, arrays)
+        driver = _of_chosen_order(seen, estimator, arrays)
     else:
         driver = _driver(seen, options.order, estimator, arrays)
     for one in seen if LOG.isEnabledFor(logging.INFO) else ():
@@ -166,10 +167,10 @@ def _refused(seen: Inspected, name: str | None) -> None:
         raise IdentificationError(text, None)
 
 
-def _of_least_order(
+def _of_chosen_order(
     seen: Sequence[Inspected], estimator: AbstractEstimator, instrument: Instrument | None
 ) -> Driver:
-    """The driver of the least order that the calibrations support."""
+    """The driver of the order that `next_order` and `best` choose."""
     drivers: dict[int, HarmonicDriver] = {}
     tried: list[TriedOrder] = []
     while (order := next_order(tried)) is not None:

@@ -43,7 +43,7 @@ from etid.recordings.hdf5 import read, read_with_driver
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import claimed, replace_text
 from etid.recordings.study import Study
-from etid.results.driver import AUTO, Order
+from etid.results.driver import Order
 from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 
@@ -231,7 +231,7 @@ def fit_file(
     target: str | os.PathLike[str],
     *,
     driver: str | os.PathLike[str] | None = None,
-    order: Order | None = None,
+    order: Order = 5,
     circuit: Circuit = None,
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
@@ -250,7 +250,7 @@ def fit_file(
         target: File of fits to write. Until it is complete, its parts are in `target.parts`.
         driver: File of the driver of all recordings, as `Driver.write` writes it, in
             place of the calibrations of the source.
-        order: As in `identify_driver`; default 5, with `driver` `"auto"` as in `read_driver`.
+        order: As in `identify_driver`.
         circuit: As in `identify_skins`. With `"auto"` a sample of the recordings chooses it.
         method: As in `identify_skin`.
         fixed: As in `identify_skin`, for all recordings.
@@ -273,8 +273,6 @@ def fit_file(
             has calibrations of no driver or of several, or another process is writing the target.
         ValueError: The source has no loaded recording.
     """
-    if order is None:
-        order = 5 if driver is None else AUTO
     of_fit = FitOptions(method=method, fixed=fixed, prior=prior, bounds=bounds)
     options = Options.of(
         candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit

@@ -29,11 +29,7 @@ from etid.signals.transfer import Rational, delay_variable, reciprocal
 
 Order = int | Literal["auto"]
 AUTO: Literal["auto"] = "auto"
-# A transformer has a slow pole (magnetising inductance), a resonance (leakage inductance and
-# winding capacitance), and faster poles at the edge of the band. At 40 dB noise hides these from
-# every test, and yet they shift elements by more than a standard error if the driver has no pole
-# for them (`python -m benchmarks driver_order`). Four is therefore the least order.
-LEAST, LARGEST = 4, 8
+LEAST, LARGEST = 4, 8  # orders for which a driver has room for evidence
 
 
 class OrderEvidence(Module):

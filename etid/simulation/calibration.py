@@ -1,30 +1,44 @@
 """What a calibration is worth, while the resistor is still connected.
 
-The driver is identified from the calibrations. Recordings of skin behind it, as they would be made
-with the same pulses and the same noise, are imitated and fitted: their standard errors are those to
-expect. The same is done with a further known resistor, to see whether it would help.
+The driver is identified from the calibrations. The standard errors to expect of skin behind it are
+the Cramer-Rao bound of its fit, for the same pulses and the same noise. Unlike `etid.bound`, which
+holds for every driver, this bound knows what the fit knows: a Z_th with as many poles, and the
+tolerances of the instrument. No random number is drawn. A further resistor or further periods
+therefore never make an expected error larger.
 """
 
 import dataclasses
+import math
 import os
 from collections.abc import Mapping, Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import scipy
+from jaxtyping import Array, Float
 
-from etid.circuits.circuit import Resistor, SkinRC
+from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.display import per_cent, rounded, several
 from etid.circuits.overview import Overview, Overviewed
+from etid.estimators.estimate import delay_std
+from etid.estimators.maximum_likelihood import given_driver
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.load_fit import inverse_information
+from etid.estimators.maximum_likelihood.profile import Records
 from etid.identify.arguments import check_new
-from etid.identify.driver import identify_driver
+from etid.identify.driver import identify_driver, with_harmonics
 from etid.identify.skins import identify_skin
+from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.hdf5 import read_calibrations
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
-from etid.results.driver import AUTO, Driver, Order
-from etid.results.fit import Fit, IdentificationError
+from etid.results.driver import Calibration, ContinuousDriver, Driver, HarmonicDriver, Order
+from etid.signals.transfer import as_complex
 from etid.simulation.published import TYPICAL
+from etid.solvers.matrices import inverse_root
 
 SKINS = {name: SkinRC(**dataclasses.asdict(skin)) for name, skin in TYPICAL.items()}
 DECADE = np.array([1.0, 2.2, 4.7])  # resistors that a laboratory has
@@ -33,6 +47,7 @@ NOW, MORE = "as now", f"{LONGER:g} times as many periods"  # what is recorded
 BAND = np.geomspace(300.0, 60e3, 24)  # [Hz] where drivers are compared
 MOVED = 4.0  # standard errors; two good calibrations differ by more once in 2 000 pairs
 GOAL = 0.01  # standard error of an element for which the number of periods is told
+MOST = 1e4  # times as many periods
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -42,7 +57,10 @@ class CheckedCalibration(Overviewed):
     Attributes:
         driver: The driver.
         noise: Standard deviation of the noise of V_out in each of its recordings [V].
-        expected: Relative standard errors of the elements, by skin and by what is recorded.
+        expected: Relative standard errors of the elements, by skin and by what is recorded; empty
+            if the calibrations hold no whole pulse period.
+        times: Times as many periods of calibrations and skin that make the least known element
+            known to `GOAL`; infinite if it takes more than `MOST`, NaN if it is known now.
         moved: Largest difference of |Z_th| from that of the former driver [standard errors]; NaN
             without one.
         shifts: Relative change of the elements of skin if they are identified with the former
@@ -57,6 +75,7 @@ class CheckedCalibration(Overviewed):
     moved: float = float("nan")
     shifts: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
     r_load: float | None = None
+    times: float = float("nan")
 
     def _overview(self) -> Overview:
         records = [
@@ -69,30 +88,40 @@ class CheckedCalibration(Overviewed):
             for skin, by in self.expected.items()
             for what, errors in by.items()
         ]
+        notes, known = self._since(), several(len(records), "calibration") + ":"
+        if not rows:
+            then = (Overview(known, records, heads, notes=notes),)
+            return dataclasses.replace(self.driver._overview(), then=then)
         errors = Overview(
-            "standard errors to expect of skin:",
+            "standard errors to expect of typical skin:",
             rows,
             ("skin", "recorded", *SkinRC().names()),
-            notes=[*self._what_helps(), *self._since()],
+            notes=[*self._what_helps(), *notes],
         )
-        known = Overview(several(len(records), "calibration") + ":", records, heads)
-        return dataclasses.replace(self.driver._overview(), then=(known, errors))
+        then = Overview(known, records, heads), errors
+        return dataclasses.replace(self.driver._overview(), then=then)
 
-    def _what_helps(self) -> list[str]:
-        """What makes the largest error smaller, and how many periods make it 1 %."""
-        if not self.expected:
-            return []
-        error, skin, name = max(
+    def _least_known(self) -> tuple[float, str, str]:
+        """The largest error as it is recorded now, its skin and its element."""
+        return max(
             (error, skin, name)
             for skin, by in self.expected.items()
             for name, error in by[NOW].items()
         )
+
+    def _what_helps(self) -> list[str]:
+        """What makes the largest error smaller, and how many periods make it 1 %."""
+        error, skin, name = self._least_known()
         then, what = min(
             (errors[name], what) for what, errors in self.expected[skin].items() if what != NOW
         )
-        text = f"{name} of {skin} skin is least known; {what} helps most: {per_cent(then)}"
-        times = np.ceil((error / GOAL) ** 2)
-        return [text + (f"; 1 % takes {times:.0f} times as many periods" if times > 1 else "")]
+        now, then = (f"± {per_cent(of)}" for of in (error, then))
+        notes = [f"least known is {name} of {skin} skin, {now}; what helps most: {what}, {then}"]
+        if self.times <= MOST:
+            notes += [f"1 % takes {np.ceil(self.times):.0f} times as many periods"]
+        elif np.isinf(self.times):
+            notes += [f"not even {MOST:g} times as many periods make it 1 %"]
+        return notes
 
     def _since(self) -> list[str]:
         if not np.isfinite(self.moved):
@@ -120,7 +149,7 @@ class CheckedCalibration(Overviewed):
 def calibrate(
     calibrations: Recording | Sequence[Recording],
     *,
-    order: Order = AUTO,
+    order: Order = 5,
     former: Driver | None = None,
 ) -> CheckedCalibration:
     """Identify a driver, and say what it is worth and whether it has changed.
@@ -141,23 +170,115 @@ def calibrate(
     records = [calibrations] if isinstance(calibrations, Recording) else list(calibrations)
     driver = identify_driver(records, order=order)
     noise = [float(Inspected(one).sigma[1]) for one in records]
-    trials = {name: imitated(records[0], driver, skin, 0) for name, skin in SKINS.items()}
-    now = {name: _fitted(trial, driver) for name, trial in trials.items()}
-    expected = {name: {NOW: _errors(fit), MORE: _errors(fit, LONGER)} for name, fit in now.items()}
     r = _further(driver, [one.r_load or 0.0 for one in records])
-    found = _with_resistor(records, driver, r)
-    for name, skin in SKINS.items():
-        if found is not None:
-            errors = _errors(_fitted(imitated(records[0], found, skin, 0), found))
-            expected[name][f"also with {r / 1e3:g} kΩ"] = errors
-    known = CheckedCalibration(driver, noise, expected)
+    known = CheckedCalibration(driver, noise, {})
+    if all(Inspected(one).whole_periods[0] for one in records):
+        assert isinstance(driver, ContinuousDriver)  # as the default methods make it
+        feed = driver if isinstance(driver, HarmonicDriver) else with_harmonics(driver, records)
+        ways = {NOW: (None, 1.0), MORE: (None, LONGER), f"also with {r / 1e3:g} kΩ": (r, 1.0)}
+        expected = {
+            name: {what: expected_errors(feed, skin, *way) for what, way in ways.items()}
+            for name, skin in SKINS.items()
+        }
+        known = dataclasses.replace(known, expected=expected)
+        known = dataclasses.replace(known, times=_times(feed, *known._least_known()))
     if former is None:
         return known
-    shifts = {name: _shift(now[name], _fitted(trial, former)) for name, trial in trials.items()}
+    trials = {name: imitated(records[0], driver, skin) for name, skin in SKINS.items()}
+    shifts = {name: _shift(trial, driver, former) for name, trial in trials.items()}
     return _compared(dataclasses.replace(known, shifts=shifts), former)
 
 
-def read_driver(path: str | os.PathLike[str], *, order: Order = AUTO) -> Driver:
+@in_float64
+def expected_errors(
+    driver: HarmonicDriver,
+    circuit: AbstractCircuit,
+    further: float | None = None,
+    periods: float = 1.0,
+) -> dict[str, float]:
+    """The standard errors to expect of a load behind a driver.
+
+    Args:
+        driver: The driver; the load is recorded with the pulses and the noise of its first
+            calibration, and has an unloaded record of its own.
+        circuit: The load, with its elements.
+        further: Resistor of one more calibration, which has an unloaded record of its own [ohm].
+        periods: Times as many periods of all calibrations and of the load.
+
+    Returns:
+        Relative standard errors of the elements, by name.
+    """
+    resistors = np.array([] if further is None else [further])
+    of = jax.device_put((resistors, np.array(periods)))
+    errors = _bound(driver, *of, jax.tree.map(jnp.asarray, circuit))
+    return dict(zip(circuit.names(), np.asarray(errors).tolist(), strict=True))
+
+
+@program
+def _bound(
+    driver: HarmonicDriver,
+    further: Float[Array, " resistor"],
+    periods: Float[Array, ""],
+    circuit: AbstractCircuit,
+) -> Float[Array, " element"]:
+    """Bound of the standard errors of the logarithms of the elements: H⁻¹ without any noise."""
+    now = Calibrations.of(driver)
+    model = _as_recorded(now, further, periods)
+    common = model.start()
+    linear = model.linear(model.near(common))
+    # The width of the prior of Z_th is that of the known resistors as they are now.
+    source, (_, weak) = slice(driver.cov.shape[0]), now.weak(now.start())
+    prior = linear.precision.at[source, source].set((weak @ weak.T)[source, source])
+    information = linear.told(linear.jacobian) + prior
+    later = driver.drift_std()
+    later = jnp.pad(jnp.diag(later), ((0, common.size - later.size), (0, 0)))
+    directions = jnp.concatenate([inverse_root(information), later], axis=1)
+    first = jax.tree.map(lambda leaf: leaf[0], model.spectra)
+    count = directions.shape[1]
+    known = jnp.zeros(count), jnp.eye(count)
+    given = given_driver.around(model, common, directions, first.frequency, False, *known)
+    load = Load.behind(given, circuit, Records.of(first), model.rate)
+    unknown = jnp.zeros(load.gains.outputs + count)  # the delay and z
+    q = jnp.concatenate([circuit.log_values(), unknown])
+    records = dataclasses.replace(load.records, y=load.gains(q) * first.x[None])
+    load = dataclasses.replace(load, records=records)
+    variance = jnp.diagonal(inverse_information(load, load.near(q)))
+    return jnp.sqrt(variance[: load.gains.elements])
+
+
+def _as_recorded(
+    model: Calibrations, further: Float[Array, " resistor"], periods: Float[Array, ""]
+) -> Calibrations:
+    """Calibrations without noise in V_out, with further ones and times as many periods."""
+    of, spectra = model.calibration, model.spectra
+    more = jax.tree.map(lambda leaf: jnp.repeat(leaf[:1], further.size, axis=0), spectra)
+    # Another unloaded record with the same power, on which alone the information depends.
+    more = dataclasses.replace(more, x=as_complex(jnp.abs(more.x)))
+    spectra = jax.tree.map(lambda *both: jnp.concatenate(both), spectra, more)
+    variances = spectra.variance_x / periods, spectra.variance_y / periods
+    spectra = dataclasses.replace(spectra, variance_x=variances[0], variance_y=variances[1])
+    r_load = jnp.concatenate([of.r_load, further])
+    delays = jnp.concatenate([of.delay_samples, jnp.zeros_like(further)])
+    of = Calibration(r_load, delays, delay_std(r_load))
+    model = dataclasses.replace(model, calibration=of, spectra=spectra)
+    y = model.gains(model.start()) * spectra.x
+    return dataclasses.replace(model, spectra=dataclasses.replace(spectra, y=y))
+
+
+def _times(driver: HarmonicDriver, now: float, skin: str, name: str) -> float:
+    """`CheckedCalibration.times`, to half a per cent."""
+
+    def excess(log: float) -> float:
+        return expected_errors(driver, SKINS[skin], periods=math.exp(log))[name] - GOAL
+
+    if now <= GOAL:
+        return float("nan")
+    if excess(math.log(MOST)) > 0:
+        return float("inf")
+    return math.exp(float(scipy.optimize.brentq(excess, 0.0, math.log(MOST), xtol=5e-3)))
+
+
+def read_driver(path: str | os.PathLike[str], *, order: Order = 5) -> Driver:
     """Identify the driver of the calibrations in a file, as `Driver.write` writes it.
 
     Args:
@@ -188,40 +309,30 @@ def calibrations_in(paths: Sequence[str | os.PathLike[str]]) -> list[Recording]:
     return records
 
 
-def imitated(recording: Recording, driver: Driver, load: SkinRC | Resistor, seed: int) -> Recording:
-    """The recording as it would be with another load: whole periods, with noise of its own."""
+def imitated(recording: Recording, driver: Driver, skin: SkinRC) -> Recording:
+    """The recording as it would be with skin: whole periods, with noise of its own."""
     seen = Inspected(recording)
     _, size = seen.whole_periods
     f = jax.device_put(np.fft.rfftfreq(size, 1 / recording.sample_rate)[1:])
-    z, z_th = np.asarray(load.response(f)), np.asarray(driver.response(f))
+    z, z_th = np.asarray(skin.response(f)), np.asarray(driver.response(f))
     spectrum = np.fft.rfft(recording.v_th[:size])
     spectrum[1:] *= z / (z + z_th)
-    noise = np.random.default_rng(seed).standard_normal(size) * float(seen.sigma[1])
-    r_load = float(load.r) if isinstance(load, Resistor) else None
+    noise = np.random.default_rng(0).standard_normal(size) * float(seen.sigma[1])
     return recording.replace(
         v_th=recording.v_th[:size],
         v_out=np.fft.irfft(spectrum, size) + noise,
-        r_load=r_load,
-        path=f"imitated/{seed}",
+        r_load=None,
+        path="imitated",
         adc_range=None,
-        instrument=None if r_load is None else recording.instrument,
+        instrument=None,
     )
 
 
-def _fitted(recording: Recording, driver: Driver) -> Fit:
-    return identify_skin(recording, driver, throw=False)
-
-
-def _shift(fit: Fit, other: Fit) -> dict[str, float]:
-    """Relative differences of the elements of another fit."""
-    ratio = np.asarray(other.circuit.values()) / np.asarray(fit.circuit.values())
-    return dict(zip(fit.circuit.names(), (ratio - 1).tolist(), strict=True))
-
-
-def _errors(fit: Fit, periods: float = 1.0) -> dict[str, float]:
-    """Relative standard errors, with so many times the periods of calibration and skin."""
-    errors = np.sqrt(np.diagonal(np.asarray(fit.cov))) / np.asarray(fit.circuit.values())
-    return dict(zip(fit.circuit.names(), (errors / np.sqrt(periods)).tolist(), strict=True))
+def _shift(recording: Recording, driver: Driver, other: Driver) -> dict[str, float]:
+    """Relative change of the elements by another driver; both fits have the same noise."""
+    now, then = (identify_skin(recording, of, throw=False).circuit for of in (driver, other))
+    ratio = np.asarray(then.values()) / np.asarray(now.values())
+    return dict(zip(now.names(), (ratio - 1).tolist(), strict=True))
 
 
 def _further(driver: Driver, known: Sequence[float]) -> float:
@@ -230,20 +341,6 @@ def _further(driver: Driver, known: Sequence[float]) -> float:
     near = np.outer(10.0 ** np.arange(0, 8), DECADE).ravel()
     r = float(near[np.argmin(np.abs(np.log(near / z_th)))])
     return 10 * r if any(0.5 < r / one < 2 for one in known) else r
-
-
-def _with_resistor(records: Sequence[Recording], driver: Driver, r: float) -> Driver | None:
-    """The driver with a further calibration; None if it gives none."""
-    size = Inspected(records[0]).whole_periods[1]
-    own = [
-        one.replace(v_th=one.v_th[:size], v_out=one.v_out[:size], adc_range=None) for one in records
-    ]
-    try:
-        return identify_driver(
-            [*own, imitated(records[0], driver, Resistor(r), 1)], order=driver.order
-        )
-    except IdentificationError:
-        return None
 
 
 def _compared(of: CheckedCalibration, former: Driver) -> CheckedCalibration:

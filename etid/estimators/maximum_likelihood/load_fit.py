@@ -192,6 +192,14 @@ def _effects(
     return Effects.of_errors(moved, errors.told, later)
 
 
+def inverse_information(load: Load, near: Near) -> Float[Array, "q q"]:
+    """H⁻¹: how the parameters move with the means of their priors.
+
+    Without noise in the records it is the Cramer-Rao bound of their covariance.
+    """
+    return _linear(load, near, near.profile.excess(load.known(near.q)))[0].bread()
+
+
 def other_circuit_at(
     spectrum: Spectrum,
     own: LoadUnknowns,
