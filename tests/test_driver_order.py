@@ -18,7 +18,7 @@ from etid.estimators import refined_driver
 from etid.estimators.starts import source_starts
 from etid.identify import driver as identify
 from etid.numpy_tier.tiers import program
-from etid.results.driver import LARGEST, ContinuousDriver
+from etid.results.driver import AUTO, LARGEST, ContinuousDriver, HarmonicDriver, Order
 from etid.selection.driver_order import FIRST, TriedOrder, best, evidence, next_order
 from etid.simulation.transformer import TransformerDriver
 
@@ -83,10 +83,11 @@ def nine_periods(seed, parts=0.03):
     return with_driver(scene(50.0, 30_000), seed, parts)
 
 
-def errors_of(of, seed, order="auto"):
+def errors_of(of, seed, order: Order = AUTO):
     """The driver of a scene, and the errors of the elements in standard errors."""
     study = of.simulate(seed)
     driver = etid.identify_driver(study["calibration/0"], order=order, throw=False)
+    assert isinstance(driver, HarmonicDriver)
     found = []
     for path in LOADS:
         fit = etid.identify_skin(study[path], driver, throw=False)

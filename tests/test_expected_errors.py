@@ -9,6 +9,7 @@ import pytest
 import etid
 from benchmarks.coverage import scene
 from benchmarks.ladder import LOADS
+from etid.results.driver import HarmonicDriver
 from etid.simulation.calibration import MOST, NOW, SKINS, expected_errors
 from etid.simulation.published import REFERENCE
 
@@ -179,6 +180,7 @@ def test_drawn_recordings_scatter_as_expected(resistors):
         known = list(study.calibrations.recordings())
         driver = etid.identify_driver(known, throw=False)
         first = etid.identify_driver(known[0], throw=False)
+        assert isinstance(first, HarmonicDriver)
         fits = {name: etid.identify_skin(study[name], driver, throw=False) for name in LOADS}
         errors.append([
             np.array(fits[name].circuit.values()) / list(drawn.truth()[name].values()) - 1

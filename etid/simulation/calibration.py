@@ -208,9 +208,8 @@ def expected_errors(
     Returns:
         Relative standard errors of the elements, by name.
     """
-    resistors = np.array([] if further is None else [further])
-    of = jax.device_put((resistors, np.array(periods)))
-    errors = _bound(driver, *of, jax.tree.map(jnp.asarray, circuit))
+    resistors = jnp.array([] if further is None else [further])
+    errors = _bound(driver, resistors, jnp.array(periods), jax.tree.map(jnp.asarray, circuit))
     return dict(zip(circuit.names(), np.asarray(errors).tolist(), strict=True))
 
 
