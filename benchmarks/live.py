@@ -18,7 +18,7 @@ import numpy as np
 
 import etid
 from benchmarks.machine import RESULTS
-from benchmarks.online import CHARGE, problem
+from benchmarks.online import CHARGE, OFFSET, problem
 from benchmarks.runner import Target, at_most, option, report
 from etid.live.loop import Tick, follow
 from etid.live.view import LiveView
@@ -125,7 +125,7 @@ def paced(tracker: etid.Tracker, pulses: np.ndarray, number: int) -> Iterator[Bl
         first = round(at * tracker.period)
         due = begin + (first + pulses.shape[-1]) / tracker.model.bands.sample_rate
         time.sleep(max(0.0, due - time.monotonic()))
-        yield first, pulses[at % len(pulses)]
+        yield first, pulses[at % len(pulses)] + OFFSET * at
 
 
 def resident(process: int | None) -> int:

@@ -36,6 +36,7 @@ RIVAL_TICKS = 30
 OFF = 0.05  # of the elements, by which its start differs from what the tracker has found
 WARM = 50  # ticks before the first that counts: compilation, and the start of every electrode
 KINDS = 60  # different pulses, over and over
+OFFSET = 1e-6  # [V] from pulse to pulse: bits that come back would be an old window
 NOISES = (60.0, 40.0)  # [dB] of the false alarms; the ticks have the first
 CHANGE = 1e-3  # random walk that the tracker expects in the ticks [1/√pulse]
 
@@ -86,7 +87,7 @@ def timed(
     gc.collect()
     gc.freeze()  # the garbage collector does not search again what exists now
     for number in tqdm(range(WARM + ticks), disable=None):
-        v_out = pulses[number % len(pulses)]
+        v_out = pulses[number % len(pulses)] + OFFSET * number
         begin = time.perf_counter(), time.process_time()
         state = tracker.update(state, v_out)
         controller.command(state, charge=CHARGE)

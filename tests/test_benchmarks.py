@@ -32,7 +32,7 @@ from benchmarks.rivals import RivalError
 
 # What is run of each benchmark, what it writes into the folder {}, and what its output must say.
 # So few draws scatter too much for most targets.
-HAZARDS = "--hazard-electrodes 12 --hazard-pulses 30"
+HAZARDS = "--hazard-electrodes 19 --hazard-pulses 30"
 CASES = {
     "amplitude_errors": ("--draws 2", "", "scene 0: covered"),
     "amplitudes": ("", "", "error of harmonic balance"),

@@ -5,7 +5,8 @@ import functools
 import numpy as np
 import pytest
 
-from benchmarks.control_hazards import CELLS, SHORT, WANTED, Hazards
+from benchmarks.control_hazards import CAP, CELLS, FIRST, SHORT, WANTED, WET, Hazards
+from benchmarks.control_plant import closed_loop
 from etid.online.controller import RAISE
 
 PULSES = 150
@@ -56,9 +57,34 @@ def test_skin_gets_the_wanted_charge_and_a_quarter_more_at_a_pulse():
     assert (abs(steps.charge[reached] / WANTED - 1) < 0.02).all()
 
 
+@pytest.mark.parametrize("length", [12, 20])
+def test_a_ring_that_is_not_filled_any_more_ends_with_amplitude_0(length):
+    """All electrodes become wet two pulses after it began to return old windows, for ever."""
+    found, lanes, begin, pulses = hazards(), 4, 40, 100
+    load, ring = np.full((pulses, lanes), FIRST), []
+    load[begin + length + 2 :] = WET
+    controller, alarms = found.controller(lanes), []
+
+    def told(number, v, amplitude):
+        if begin <= number < begin + length:
+            ring.append(v)
+        old = number >= begin + length
+        return ring[(number - begin) % length] if old else v, amplitude[0]
+
+    given = closed_loop(found.display, controller, load, WANTED, told)
+    for number, pulse in enumerate(given):
+        alarms += controller.tracker.changes(pulse.state)
+        charge = found.display.charges(load[number], pulse.amplitude)
+        assert (charge <= CAP).all(), number
+        if number > begin + length:
+            assert (pulse.command.amplitude == 0).all(), number
+    [alarm] = [one for one in alarms if one.kind == "repeated"]
+    assert (alarm.pulse, alarm.electrode) == (begin + length + 1, None)
+
+
 @pytest.mark.parametrize("snr", [60.0, 40.0])
 def test_the_cap_holds_at_a_hundred_thousand_pulses(snr):
     found, pulses = hazards(snr), 420
-    controller = found.controller(20 * len(CELLS))
+    controller = found.controller(13 * len(CELLS))
     for cell, one in found.given(controller, CELLS, pulses).items():
         holds(one.row(snr, cell))
