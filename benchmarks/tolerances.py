@@ -78,7 +78,7 @@ def study(
     of = lab.all_records(lab.out(gain=1 + error["gain"]))(of)
     of = lab.all_records(lab.crosstalk(0.0, error["crosstalk"]))(of)
     of = lab.trials(lab.shunted(error["capacitance"]))(of)
-    of = lab.calibrations(lab.shunted(error["c_load"]))(of)
+    of = lab.calibrations(lab.shunted(abs(error["c_load"])))(of)  # no carrier has a negative one
     of = lab.calibrations(lab.record(r_load=lab.REFERENCE / (1 + error["r_load"])))(of)
     if "drift" in names:  # of all parts, independently
         later = lab.drawn_driver(FIRST + number, SIZES["drift"], of.trials[0].out.driver)

@@ -272,8 +272,9 @@ def test_a_file_with_an_instrument_is_checked_exported_and_fitted_otherwise(tmp_
     assert (tmp_path / "study.nwb").exists()
 
 
-def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax():
-    *known, skin = trials({"skin": DRY}, known=(R_LOAD, 21.62e3)).recordings()
+@pytest.mark.parametrize("resistors", [(R_LOAD,), (R_LOAD, 21.62e3)])
+def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax(resistors):
+    *known, skin = trials({"skin": DRY}, known=resistors).recordings()
     driver = etid.identify_driver(known, instrument=ALL)
     assert isinstance(driver, HarmonicDriver)
     frequency = driver.spectra.frequency[0]

@@ -27,7 +27,7 @@ from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.condensed import Slopes
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.signals.knots import Knots
-from etid.signals.transfer import as_complex, combined, delayed, frequency_variable, reciprocal
+from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
 
 Current = Callable[[Complex[Array, " frequency"]], Complex[Array, " frequency"]]
 """Current per input of all that is connected to the source, from its impedance [Ω]."""
@@ -144,7 +144,7 @@ class Gains(eqx.Module):
     def w(self, z: Float[Array, " z"]) -> Complex[Array, " frequency"]:
         """W − W₀."""
         off = jnp.log(self.frequency[0] / self.driver.frequency[0])
-        return as_complex(off) * self.driver.w_slope + combined(z, self.driver.slope)
+        return as_complex(off) * self.driver.w_slope + self.driver.w(z)[0]
 
     def undelayed(self, q: Float[Array, " q"]) -> Complex[Array, "output frequency"]:
         """The gains without their delays."""
@@ -203,7 +203,7 @@ class Gains(eqx.Module):
         rows = [
             by_element[:, None] * by_load[None],
             alone * ((-s * as_complex(1 / self.sample_rate))[None, :] * value)[None],
-            self.driver.slope[:, None] * by_w[None],
+            self.driver.w(z)[1][:, None] * by_w[None],
         ]
         if faults is not None and self.driver.faults is not None:
             by_fault = jax.jacfwd(lambda at: self._undelayed(z_load, w, at))(faults)

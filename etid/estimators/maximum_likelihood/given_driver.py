@@ -27,6 +27,12 @@ that nobody stated stays 0 in the fit. If it is not 0, the minimum of the calibr
     ∂z₀/∂θ = −Lᵀ H_cθ,
 
 and the elements with it.
+
+W is linear in all of them but a capacitance C across the only resistor, which moves it by 4 % for
+each pF. The data fix the gain of the calibration. With Q = 1 + Z_th/R, u = s R C and v = s δ, where
+δ is the change of its delay,
+
+    W = log(Q e^(−v) + u) − log(1 + u) + log R,      ∂²W = u² + 2 u v / Q − u² / Q².
 """
 
 import dataclasses
@@ -50,7 +56,7 @@ from etid.results.driver import HarmonicDriver
 from etid.results.instrument import BUDGETED, Instrument
 from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots
-from etid.signals.transfer import as_complex, combined, reciprocal
+from etid.signals.transfer import as_complex, combined, frequency_variable, reciprocal
 from etid.solvers.matrices import inverse_root
 
 
@@ -116,6 +122,8 @@ class GivenDriver(Module):
         faults: Gain, crosstalk and capacitance at z = 0 and by z; None if the instrument has no
             tolerances.
         errors: The errors of the instrument; None if they are not known.
+        bend: ∂²W by the last of these errors, a capacitance across the only resistor; None if it is
+            not needed.
         aside: Distance of the first delay of a search from that of its start [samples].
         by_current: Whether the input is a measured current: the gain is Z_L, and there is no z.
     """
@@ -134,6 +142,7 @@ class GivenDriver(Module):
     delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
     faults: tuple[Float[Array, "3"], Float[Array, "z 3"]] | None = None
     errors: InstrumentErrors | None = None
+    bend: Complex[Array, " harmonic"] | None = None
     aside: Float[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     by_current: bool = eqx.field(static=True, default=False)
 
@@ -154,6 +163,17 @@ class GivenDriver(Module):
             gain_slopes=None,
             by_current=True,
         )
+
+    def w(
+        self, z: Float[Array, " z"]
+    ) -> tuple[Complex[Array, " harmonic"], Complex[Array, "z harmonic"]]:
+        """W − W₀ by z, and its derivatives."""
+        w, slope = combined(z, self.slope), self.slope
+        if self.bend is None or self.errors is None:
+            return w, slope
+        theta, by_z = self.errors.values(z)[-1], self.errors.by_z[:, -1]
+        w = w + as_complex(0.5 * theta**2) * self.bend
+        return w, slope + as_complex(theta * by_z)[:, None] * self.bend[None]
 
     def z_th(self, w: Complex[Array, " harmonic"]) -> Complex[Array, " harmonic"]:
         """Z_th [Ω] at W₀ + w."""
@@ -196,6 +216,7 @@ class GivenDriver(Module):
             loaded=knots.at(self.loaded),
             w_slope=knots.at(self.w_slope),
             slope=knots.at(self.slope),
+            bend=None if self.bend is None else knots.at(self.bend),
             records=None,
             gains=None,
             gain_slopes=None,
@@ -268,11 +289,18 @@ def given(
     if found.gain_slopes is not None:  # the calibrations tell nothing about later changes
         gain_slopes = found.gain_slopes.at[c.size :].set(0.0)
         found = dataclasses.replace(found, gain_slopes=gain_slopes)
+    bend = None
+    if told is not None and calibrations.calibration.r_load.size == 1:
+        s, resistance = frequency_variable(frequency), calibrations.calibration.r_load[0]
+        u = s * as_complex(resistance * sizes[-1])
+        v = s * as_complex(every.following(linear)[unknowns - 1, -1] / calibrations.rate)
+        inverse = as_complex(resistance) * reciprocal(found.loaded)
+        bend = u * u + 2 * u * v * inverse - (u * inverse) ** 2
     by_z = jnp.pad(directions[unknowns:].T, ((0, 0), (0, at.size - c.size)))
     errors = InstrumentErrors(
         at[unknowns:], by_z, unstated, ((1 - stated) * sizes)[:FAULTS], drift, told
     )
-    return dataclasses.replace(found, shape=shape_of(driver, frequency), errors=errors)
+    return dataclasses.replace(found, shape=shape_of(driver, frequency), errors=errors, bend=bend)
 
 
 def around(
