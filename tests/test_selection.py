@@ -94,6 +94,16 @@ def test_the_best_circuit_is_adequate_and_a_richer_one_pays_for_its_elements():
         for deviance, chosen in ((880.0, 0), (860.0, 1)):
             fits = {0: made(skin, 870.0, name), 1: made(etid.SkinWarburg(), deviance)}
             assert best(fits) == chosen
+    layer = etid.SkinWarburg()  # as many elements: it must be strongly likelier
+    for deviance, chosen in ((865.0, 0), (863.0, 1)):
+        fits = {0: made(skin, 870.0), 3: made(cole, 870.0), 5: made(layer, deviance)}
+        assert best(fits) == (chosen and 5)
+        assert best({**fits, 0: made(layer, 870.0), 5: made(skin, deviance)}) == (chosen and 5)
+        misses = {**fits, 0: made(skin, 870.0, "misfit")}
+        assert best(misses) == 5  # they do not fit alike
+        few = [choice({0: fits[0], 5: fits[5]})]
+        assert common(few, CANDIDATES) == (chosen and 5)
+        assert common(few * 6, CANDIDATES) == 5  # together they are sure
     for alpha, expected in ((0.995, 1), (0.95, 0)):  # the phase of a capacitor is no reason
         assert rank(made(etid.SkinCole(20e3, 100e3, 30e-6, alpha), 900.0)) == expected
 

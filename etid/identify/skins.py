@@ -271,7 +271,8 @@ def select_circuit(
     The evidence is −BIC = 2 log L − p ln n, for p elements and n real numbers in the data (Schwarz
     1978). A candidate that is contradicted by the data, or that has elements which the data do not
     determine, is chosen only if there is no other. Differences below 2 do not count; then the
-    circuit with the fewest elements is chosen, of those the first.
+    circuit with the fewest elements is chosen. Of circuits with equally many elements the first is
+    chosen, unless the evidence of another one is larger by 6.
 
     Args:
         recording: Unloaded and loaded voltage.

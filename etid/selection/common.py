@@ -8,14 +8,17 @@ import math
 from collections.abc import Sequence
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.selection.evidence import best, bic, elements, rank
+from etid.selection.evidence import best, bic, elements, first_alike, rank
 from etid.selection.selection import Selection
 
 LIMIT = 20.0  # largest loss of 2 log evidence by one recording; "very strong" begins at 10
 
 
 def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) -> int:
-    """Number of the candidate with the largest joint evidence; 0 if nothing is known."""
+    """Number of the candidate with the largest joint evidence; 0 if nothing is known.
+
+    Of candidates with equally many elements it is the first that fits alike, as for one recording.
+    """
     if all(len(selection.fits) == 1 for selection in found):
         return 0  # no recording asked for another circuit than the first
     known = [one for one in found if math.isfinite(bic(one.fits)[one.chosen])]
@@ -26,7 +29,10 @@ def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) ->
     for selection in explained or known:
         for number, lost in enumerate(_losses(selection, candidates)):
             total[number] -= min(lost, LIMIT)
-    return max(range(len(candidates)), key=lambda number: (total[number], -number))
+    numbers = range(len(candidates))
+    size = {number: len(candidates[number].names()) for number in numbers}
+    lost = {number: -total[number] for number in numbers}
+    return first_alike(min(numbers, key=lost.__getitem__), numbers, size, lost)
 
 
 def _losses(selection: Selection, candidates: Sequence[AbstractCircuit]) -> list[float]:

@@ -17,7 +17,7 @@ only if no candidate is adequate that has more evidence, or as much with fewer e
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -32,6 +32,10 @@ _UNDETERMINED = ("insensitive", "resolution", "driver_failed")
 # Difference of BIC that is "not worth more than a bare mention" (Kass and Raftery 1995, section
 # 3.2): of circuits that are so close, the simplest is chosen.
 MENTION = 2.0
+# Difference that is "strong" (same source): with less, circuits with equally many elements fit
+# alike, and the more usual one is chosen. In 5 of 96 recordings of damp skin at 30 and 40 dB, a
+# layer of diffusion with a third of R_s was likelier than R_s + R_p ‖ C_p by 2 to 4.3.
+ALIKE = 6.0
 
 
 def rank(fit: Fit) -> int:
@@ -79,27 +83,41 @@ def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) 
     """Number of the candidate to choose, by `criterion`, which is to be small: `bic` if not given.
 
     It is the simplest of those whose evidence is largest, up to `MENTION`, among the candidates of
-    the best rank; of equally simple ones the first, which is the most usual. A candidate with less
-    evidence than one with no more elements is not chosen, whatever their ranks: it is no remedy for
-    what that one lacks.
+    the best rank; of equally simple ones the first, which is the most usual, if it fits alike: up
+    to `ALIKE`. A candidate with less evidence than one with no more elements is not chosen,
+    whatever their ranks: it is no remedy for what that one lacks.
     """
     if len(fits) == 1:
         return next(iter(fits))
     criterion = criterion or bic(fits)
     ranks = {number: rank(fit) for number, fit in fits.items()}
     size = {number: elements(fit) for number, fit in fits.items()}
-    left = [
-        number
-        for number in fits
-        if not any(
-            size[other] <= size[number] and criterion[other] < criterion[number] - MENTION
-            for other in fits
-        )
-    ]
+
+    def is_beaten(number: int) -> bool:
+        least = min(criterion[other] + _ahead(number, other, size) for other in fits)
+        return least < criterion[number]
+
+    left = [number for number in fits if not is_beaten(number)]
     good = [number for number in left if ranks[number] == min(ranks[one] for one in left)]
     least = min(criterion[number] for number in good)
     near = [number for number in good if criterion[number] <= least + MENTION]
-    return min(near, key=lambda number: (size[number], number))
+    return first_alike(min(near, key=size.__getitem__), good, size, criterion)
+
+
+def _ahead(number: int, other: int, size: Mapping[int, int]) -> float:
+    """By how much the evidence of another candidate must exceed that of this one to beat it."""
+    if size[other] > size[number]:
+        return math.inf
+    return ALIKE if size[other] == size[number] and other > number else MENTION
+
+
+def first_alike(
+    best: int, numbers: Collection[int], size: Mapping[int, int], criterion: Mapping[int, float]
+) -> int:
+    """The first candidate with as many elements as the best, that fits alike."""
+    least = min(criterion[one] for one in numbers if size[one] == size[best])
+    alike = [one for one in numbers if size[one] == size[best] and criterion[one] <= least + ALIKE]
+    return min(alike)
 
 
 def weights(fits: Mapping[int, Fit]) -> dict[int, float]:
