@@ -13,6 +13,7 @@ import pytest
 import etid
 from etid.identify import fitting
 from etid.identify.options import Options
+from etid.recordings.hdf5 import read_with_driver
 from etid.recordings.preflight import Inspected
 from etid.results.fit import Limited
 from etid.results.instrument import ERRORS
@@ -379,3 +380,19 @@ def test_a_part_in_memory_uses_the_only_calibration_of_the_whole(study):
     assert list(part.named.calibrations) == ["calibration/0"]
     few = etid.Study.from_recordings([study["calibration/0"], study["s01/dry/2"]])
     assert etid.identify_study(few.where(condition="dry")).fits.counts() == {"successful": 1}
+
+
+def test_recordings_with_the_driver_of_another_file_survive_a_pickle(conditions, study, tmp_path):
+    """The calibrations come from the other file then, too."""
+    study.calibrations.write(tmp_path / "driver.h5")
+    with (
+        read_with_driver(conditions, tmp_path / "driver.h5") as whole,
+        copied(whole) as again,
+        copied(whole.where(condition="damp")) as damp,
+    ):
+        assert list(again) == list(whole)
+        path = "driver.h5/calibration/0"
+        assert again["s01/dry/0"].calibration == (path,)
+        np.testing.assert_array_equal(again[path].v_out, study["calibration/0"].v_out)
+        assert list(damp) == ["s01/damp/0", "s01/damp/1"]
+        np.testing.assert_array_equal(damp.named[path].v_out, study["calibration/0"].v_out)

@@ -27,7 +27,7 @@ def described(one, place=""):
         kind = "jax" if isinstance(one, jax.Array) else type(one).__name__
         return [(place, kind, str(data.dtype), data.shape, plain)]
     if isinstance(one, Mapping) and not isinstance(one, etid.Study):
-        items = list(one.items())
+        items = sorted(one.items(), key=str)
     elif isinstance(one, tuple | list):
         items = list(enumerate(one))
     elif dataclasses.is_dataclass(one) or type(one).__module__.startswith(("etid", "circuit str")):

@@ -7,6 +7,7 @@ fault of one recording is stored in `Study.problems`.
 
 import contextlib
 import dataclasses
+import functools
 import os
 import pathlib
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
@@ -49,7 +50,8 @@ def read(path: str | os.PathLike[str]) -> Study:
     first: dict[str, RecordingError] = {}
     for problem in scan.problems:
         first.setdefault(problem.path, problem)
-    return Study(scan.sources(), problems=first, file=name, close=file.close)
+    again = functools.partial(read, os.path.abspath(name))
+    return Study(scan.sources(), problems=first, file=name, close=file.close, again=again)
 
 
 def check(path: str | os.PathLike[str]) -> list[RecordingError]:
@@ -259,7 +261,8 @@ def read_with_driver(path: str | os.PathLike[str], driver: str | os.PathLike[str
         calibrations.close()
         whole.close()
 
-    return Study(moved, problems=whole.problems, file=whole.file, close=close)
+    again = functools.partial(read_with_driver, os.path.abspath(path), os.path.abspath(driver))
+    return Study(moved, problems=whole.problems, file=whole.file, close=close, again=again)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -74,10 +74,12 @@ class Study(Overviewed, Mapping[str, Recording]):
         problems: Mapping[str, RecordingError] | None = None,
         file: str = "",
         close: Callable[[], None] | None = None,
+        again: "Callable[[], Study] | None" = None,
         named: "Study | None" = None,
     ) -> None:
         self._sources = dict(sources)
         self._close = close
+        self._again = again  # opens the file, for a copy or a pickle
         self._named = named
         self.problems: dict[str, RecordingError] = dict(problems or {})
         self.file = file
@@ -247,7 +249,7 @@ class Study(Overviewed, Mapping[str, Recording]):
     def _part(
         self, belongs: Callable[[Metadata], bool], problems: Mapping[str, RecordingError]
     ) -> "Study":
-        of = {"file": self.file, "close": self._close}
+        of: dict[str, Any] = {"file": self.file, "close": self._close, "again": self._again}
         chosen, known = {}, {}
         for path, source in self._sources.items():
             metadata = source.metadata
@@ -255,7 +257,9 @@ class Study(Overviewed, Mapping[str, Recording]):
                 chosen[path] = source
             if metadata.kind == "calibration":
                 known[path] = source
-        named = self._named or Study(known, problems=self.problems, **of)
+        named = self._named
+        if named is None:
+            named = Study(known, problems=self.problems, **of)
         return Study(chosen, problems=problems, named=named, **of)
 
     def write(self, path: str | os.PathLike[str]) -> None:
@@ -288,10 +292,10 @@ class Study(Overviewed, Mapping[str, Recording]):
 
     def __reduce__(self) -> tuple:
         named = None if self._named is None else self._named._sources
-        if not self.file:
+        if self._again is None:
             return _in_memory_again, (self._sources, named)
         paths = (None if of is None else tuple(of) for of in (self._sources, named))
-        return _opened, (os.path.abspath(self.file), *paths, tuple(self.problems))
+        return _opened, (self._again, *paths, tuple(self.problems))
 
     def close(self) -> None:
         """Close the file of the study; all parts of the study use the same file."""
@@ -354,16 +358,18 @@ def _in_memory_again(
 
 
 def _opened(
-    file: str, paths: Iterable[str], named: Iterable[str] | None, problems: Collection[str]
+    again: Callable[[], Study],
+    paths: Iterable[str],
+    named: Iterable[str] | None,
+    problems: Collection[str],
 ) -> Study:
     """The recordings of a file at these paths; a copy or a pickle of a study becomes this."""
-    from etid.recordings.hdf5 import read  # it imports this module
+    whole = again()
+    of: dict[str, Any] = {"file": whole.file, "close": whole.close, "again": again}
 
-    whole = read(file)
-
-    def of(paths: Iterable[str], problems: Mapping[str, RecordingError], **more: Any) -> Study:
-        sources = {path: whole.source(path) for path in paths}
-        return Study(sources, problems=problems, file=file, close=whole.close, **more)
+    def part(paths: Iterable[str]) -> dict[str, AbstractSource]:
+        return {path: whole.source(path) for path in paths}
 
     own = {path: error for path, error in whole.problems.items() if path in problems}
-    return of(paths, own, named=None if named is None else of(named, whole.problems))
+    known = None if named is None else Study(part(named), problems=whole.problems, **of)
+    return Study(part(paths), problems=own, named=known, **of)
