@@ -16,7 +16,7 @@ from etid.identify.options import Options
 from etid.recordings.hdf5 import read_with_driver
 from etid.recordings.preflight import Inspected
 from etid.results.fit import Limited
-from etid.results.instrument import ERRORS
+from etid.results.instrument import BUDGETED, Effects
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 from tests.skins import DRY, off
@@ -279,7 +279,7 @@ def test_fits_of_a_file_and_fresh_ones_are_one_table(fits, driver, tmp_path):
     read = etid.Fits.read(tmp_path / "fits.h5")
     nothing = {"change": None, "change_stderr": None}
     bare = dataclasses.replace(part, fit=dataclasses.replace(part.fit, **nothing))
-    tolerances = np.ones((1, len(ERRORS), 3))
+    tolerances = Effects(np.ones((1, len(BUDGETED), 3)), np.zeros((1, len(BUDGETED))))
     joint = dataclasses.replace(part, fit=dataclasses.replace(part.fit, by_tolerance=tolerances))
     limits = Limited(np.zeros((1, 3)), np.full((1, 3), 1e6), np.zeros((1, 3)))
     bounded = dataclasses.replace(part, fit=dataclasses.replace(part.fit, limits=limits))

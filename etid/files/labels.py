@@ -65,13 +65,15 @@ def labelled(
         raise RecordingError(
             f"names {missing!r}, which is not in the folder", file=str(root / TABLE), field="file"
         )
+    if not files:
+        raise RecordingError("holds no file", file=str(root), remedy="Name the folder of the files")
     if not found:
         raise RecordingError(
             f"none of its {several(len(files), 'file')} matches {' or '.join(map(repr, patterns))}",
             file=str(root),
             field="labels",
-            remedy="Write the names as they are, with labels in braces"
-            + (f"; the first file is {files[0]!r}" if files else ""),
+            remedy=f"Write the names as they are, with labels in braces; the first file is "
+            f"{files[0]!r}",
         )
     calibrations_first = dict(sorted(found.items(), key=lambda one: "r_load" not in one[1]))
     return calibrations_first, [file for file in files if file not in found]

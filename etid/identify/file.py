@@ -278,7 +278,7 @@ def fit_file(
         candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit
     )
     target = pathlib.Path(target)
-    sources = tuple(os.path.abspath(one) for one in (source, driver) if one is not None)
+    sources = tuple(os.fspath(one) for one in (source, driver) if one is not None)
     study = _opened(sources)
     drivers = Drivers(study, options)
     with study, claimed(target):
@@ -287,7 +287,7 @@ def fit_file(
         stamps = tuple(os.stat(one).st_mtime_ns for one in sources)
         options = common_first(drivers, options)
         settings = options.settings(study, count)
-        settings = dataclasses.replace(settings, driver=" ".join(sources[1:]))
+        settings = dataclasses.replace(settings, driver=" ".join(map(os.path.abspath, sources[1:])))
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
             **{name.replace("_", " "): value for name, value in described.items()},
@@ -299,7 +299,10 @@ def fit_file(
         left = [number for number in numbers if not parts.path(number).exists()]
         task = functools.partial(_fit, drivers, options, PART)
         if executor is not None:
-            task = functools.partial(_fit_elsewhere, sources, stamps, options, PART)
+            places = tuple(
+                map(os.path.abspath, sources)
+            )  # another process may be in another folder
+            task = functools.partial(_fit_elsewhere, places, stamps, options, PART)
         identified = {}
         done = min(count, (len(numbers) - len(left)) * PART)
         with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:

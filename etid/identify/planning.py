@@ -51,8 +51,13 @@ class Refusal(NamedTuple):
     @classmethod
     def of(cls, error: Exception) -> "Refusal":
         """The refusal of a recording that cannot be read, or whose driver failed."""
-        failed = isinstance(error, IdentificationError)
-        return cls("driver_failed" if failed else "unreadable", str(error))
+        if isinstance(error, IdentificationError):
+            return cls("driver_failed", str(error))
+        if isinstance(error, RecordingError):  # all recordings are of one file, so it is not said
+            error = RecordingError(
+                error.message, path=error.path, field=error.field, remedy=error.remedy
+            )
+        return cls("unreadable", str(error))
 
 
 def prepared(

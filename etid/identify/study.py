@@ -174,7 +174,7 @@ class Drivers:
         names = recording.calibration or self.calibrations
         if not recording.calibration and len(self.calibrations) != 1:
             raise RecordingError(
-                f"names no calibration and the study has {len(self.calibrations)}",
+                f"names no calibration and the study has {len(self.calibrations) or 'none'}",
                 path=recording.path,
                 field="calibration",
                 remedy="Write the path of its calibration into the attribute 'calibration'"

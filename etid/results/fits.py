@@ -29,7 +29,7 @@ from etid.results.fits_columns import (
     long_form,
 )
 from etid.results.hdf5_table import Table, opened_table, write_table
-from etid.results.instrument import ERRORS
+from etid.results.instrument import Effects
 from etid.results.verdicts import counted, counts
 
 AND = " + "  # between the names of estimators
@@ -74,7 +74,7 @@ def _known(fit: Fit, name: str) -> Any:
         "limits": fit.all_limits,
         **dict(zip(("change", "change_stderr"), fit.known_changes, strict=True)),
         "support": Support.unknown(elements, lanes),
-        "by_tolerance": np.full((lanes, len(ERRORS), elements), np.nan),
+        "by_tolerance": Effects.unknown(elements, lanes),
     }
     return nothing[name]
 
