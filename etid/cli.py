@@ -82,7 +82,7 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
         Exit status.
     """
     arguments = commands.parse_args(words)
-    from etid.recordings.errors import RecordingError
+    from etid.recordings.errors import RecordingError, in_one_line
     from etid.results.fit import IdentificationError
 
     try:
@@ -95,11 +95,12 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
         with _logged() if arguments.verbose else contextlib.nullcontext():
             outcome = arguments.module.run(arguments)
     except (RecordingError, IdentificationError, ValueError, OSError) as error:
-        text = " ".join(str(error).split())
+        text = in_one_line(error)
         print(f"etid: error: {text}", file=sys.stderr)
         outcome = Outcome(data={"error": text}, status=WRONG_DATA)
-    except KeyboardInterrupt:
-        print(f"etid: interrupted: {_after_interrupt(arguments)}", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        text = in_one_line(error) or _after_interrupt(arguments)
+        print(f"etid: interrupted: {text}", file=sys.stderr)
         return INTERRUPTED
     text = outcome.text
     if arguments.json:
@@ -189,7 +190,7 @@ def _logged() -> Iterator[None]:
 
 def _after_interrupt(arguments: argparse.Namespace) -> str:
     """Message after Ctrl-C; a result is written completely or not at all."""
-    if arguments.command == "fit":
+    if hasattr(arguments.module, "after_interrupt"):
         return arguments.module.after_interrupt(arguments)
     target = getattr(arguments, "target", getattr(arguments, "page", None))
     return "nothing was changed" if target is None else f"{target} was not written"

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import http.client
+import itertools
 import json
 import os
 import pathlib
@@ -21,13 +22,17 @@ import pytest
 from chromium import chromium
 
 import etid
+from etid import cli
+from etid.commands import DONE, INTERRUPTED, WRONG_DATA
 from etid.live import view as views
 from etid.live.loop import Tick, follow
 from etid.live.server import HEADER
+from etid.live.stimulator import Stimulator
 from etid.live.view import LiveView
 from etid.online.controller import Command
 from etid.online.state import Change
-from etid.online.stream import connected, received, sender
+from etid.online.stream import PAUSE, connected, received, sender
+from etid.online.tracker import Tracker
 from etid.plotting.layout import Layout
 from etid.simulation.transformer import ResistorLoad, Sampler, loading
 from tests.test_online import (
@@ -38,6 +43,7 @@ from tests.test_online import (
     PULSES,
     RATE,
     TEN,
+    calibrated,
     quiet,
     scene,
     tracker_of,
@@ -64,16 +70,21 @@ def alone():
     }
 
 
-class Stimulator:
-    """A display at a socket: gives a pulse of each amplitude that it is sent, and records it.
+class Display:
+    """A display at a socket: when it is sent amplitudes, it gives a pulse of them and records it.
 
     Attributes:
         skin: Name of the load at each electrode, which a test may change.
-        given: Amplitudes of all pulses.
+        given: All amplitudes that it was sent.
+        silent: Whether the converter sends nothing.
+        number: Number of the next pulse.
+        raw: Bytes to send in place of the next block; none: the connection is closed.
+        line: The connection.
     """
 
     def __init__(self, electrodes):
         self.skin, self.given = ["dry"] * electrodes, []
+        self.silent, self.number, self.raw = False, 0, None
         self.server = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.server.getsockname()[1]}"
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -82,31 +93,43 @@ class Stimulator:
     def _run(self):
         pulses, noise = alone(), np.random.default_rng(0)
         with self.server, self.server.accept()[0] as line, line.makefile("rb") as stream:
-            before = np.zeros(len(self.skin))
+            before, self.line = np.zeros(len(self.skin)), line
             with contextlib.suppress(ConnectionError):
                 while len(told := stream.read(8 * len(self.skin))) == 8 * len(self.skin):
                     now = np.frombuffer(told, "<f8")
                     self.given.append(now)
+                    if self.silent:
+                        continue
+                    if self.raw is not None:
+                        if not self.raw:
+                            return
+                        line.sendall(self.raw)
+                        self.silent = True
+                        continue
                     of = np.stack([pulses[name] for name in self.skin])
                     v = now[:, None] * of[:, 0] + before[:, None] * of[:, 1]
                     v += NOISE * noise.standard_normal(v.shape)
-                    begin = round((len(self.given) - 1) * PERIOD)
+                    begin = round(self.number * PERIOD)
                     line.sendall(np.array([begin, *v.shape], "<i8").tobytes() + v.tobytes())
-                    before = now
+                    before, self.number = now, self.number + 1
                     time.sleep(0.01)
+
+    def positive(self):
+        """How often it was sent an amplitude that is not 0."""
+        return sum(one.any() for one in self.given)
 
 
 def controller_of(electrodes, **limits):
     return etid.Controller.of(tracker_of(electrodes, 3e-3), **limits)
 
 
-def tick_of(tracker, number=0, changes=(), *, stopped=False, reason="wanted"):
+def tick_of(tracker, number=0, changes=(), *, reason="wanted"):
     """A tick of a display that was shown nothing yet."""
     lanes, state = tracker.electrodes, tracker.start()
     ones = np.ones(lanes)
     command = Command(ones, ones, ones, ones, ones, np.full(lanes, reason))
     window = np.zeros((lanes, tracker.model.bands.samples))
-    return Tick(number, window, state, state, command, list(changes), stopped, 1e-3, 0, 0)
+    return Tick(number, window, state, state, command, list(changes), 1e-3, 0, 0)
 
 
 def opened(electrodes=TEN, **options):
@@ -350,22 +373,139 @@ if __name__ == "__main__":
 
 
 @contextlib.contextmanager
-def running(view, stimulator, controller):
-    """A controller that follows the stimulator, in a thread; yields its ticks."""
+def running(view, display, controller):
+    """A controller that follows the display, in a thread; yields its ticks."""
     ticks = []
 
     def run():
-        with connected(stimulator.address) as line:
-            stream = follow(received(line), controller, charge=WANTED, send=sender(line), view=view)
-            ticks.extend(tick._replace(window=None, before=None) for tick in stream)
+        with connected(display.address) as line:
+            lanes = controller.tracker.electrodes
+            with Stimulator(sender(line), lanes, 1 / PULSES, view) as stimulator:
+                blocks = received(line, lambda: stimulator.stopped)
+                options = {"charge": WANTED, "stimulator": stimulator, "view": view}
+                stream = follow(blocks, controller, **options)
+                for tick in stream:
+                    ticks.append(tick._replace(window=None, before=None))
 
     thread = threading.Thread(target=run)
     thread.start()
     try:
         yield thread, ticks
     finally:
-        view._slot.stop.value = 1
+        stop(view)
         thread.join(60)
+        assert not thread.is_alive()
+
+
+def stop(view):
+    """Press STOP; the answer of the page."""
+    return asked(view, "POST", "/stop", **{HEADER: token_of(view)})
+
+
+def wait_for(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "not in time"
+        time.sleep(0.005)
+
+
+def test_a_pause_and_a_counter_that_begins_anew_cost_a_rest_and_stop_is_obeyed_in_silence():
+    display = Display(TEN)
+    with opened() as view, running(view, display, controller_of(TEN)) as (thread, ticks):
+        assert not display.positive()
+        wait_for(lambda: display.positive() > 10)
+        display.silent = True
+        wait_for(lambda: not display.given[-1].any())
+        display.silent, positive = False, display.positive()
+        wait_for(lambda: display.positive() > positive + 5)
+        assert display.number > PAUSE + 5
+        display.number = 0  # the stimulator was started again
+        wait_for(lambda: not display.given[-1].any())
+        wait_for(lambda: display.given[-1].any())
+        for reason in ("no new amplitude for 0.33 s", "the counter of samples began anew"):
+            text = f"{reason}: amplitude 0 was sent, and stimulation begins anew from rest"
+            wait_for(lambda text=text: any(text in alarm for alarm in shown(view)["alarms"]))
+        display.silent = True
+        assert json.loads(stop(view)[1]) == {"zero": True}
+        assert not display.given[-1].any()
+        thread.join(30)
+        assert not thread.is_alive()
+    display.thread.join(30)
+    assert not display.given[-1].any()
+    pulses = [int(tick.state.electrodes.pulses.max()) for tick in ticks]
+    assert sum(now < before for before, now in itertools.pairwise(pulses)) >= 2, "it begins anew"
+
+
+def test_a_stop_before_the_first_pulse_lets_no_pulse_be_given(monkeypatch):
+    """It comes while programs compile."""
+    display, update, answers = Display(TEN), Tracker.update, []
+
+    def stopping(*arguments):
+        answers.append(json.loads(stop(view)[1]))
+        return update(*arguments)
+
+    monkeypatch.setattr(Tracker, "update", stopping)
+    with opened() as view, running(view, display, controller_of(TEN)) as (thread, ticks):
+        thread.join(60)
+    display.thread.join(30)
+    assert (answers, ticks) == ([{"zero": True}], [])
+    assert display.given
+    assert not display.positive()
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory):
+    """A file of the calibrations that `tracker_of` has."""
+    file = tmp_path_factory.mktemp("live") / "calibration.h5"
+    calibrated()[1].write(file)
+    return file
+
+
+SENT = "amplitude 0 was sent to all electrodes"
+ENDS = {
+    "Ctrl-C": (INTERRUPTED, f"etid: interrupted: {SENT}"),
+    "other electrodes": (WRONG_DATA, f"etid: error: a block has 11 electrodes, not 10; {SENT}"),
+    "no header": (WRONG_DATA, f"64 bits?; {SENT}"),
+    "hangs up": (WRONG_DATA, "AMPLITUDE 0 COULD NOT BE SENT"),
+    "closes its half": (DONE, ""),
+}
+
+
+@pytest.mark.parametrize("how", ENDS)
+def test_the_command_leaves_0_behind_and_says_so(calibration, how, capsys):
+    display = Display(TEN)
+
+    def end():
+        wait_for(lambda: display.positive() > 3)
+        match how:
+            case "Ctrl-C":
+                os.kill(os.getpid(), signal.SIGINT)
+            case "other electrodes":
+                display.raw = np.array([0, TEN + 1, 1], "<i8").tobytes() + bytes(8 * (TEN + 1))
+            case "no header":
+                display.raw = bytes(24)
+            case "hangs up":
+                display.raw = b""
+            case "closes its half":
+                display.silent = True
+                display.line.shutdown(socket.SHUT_WR)
+
+    ending = threading.Thread(target=end)
+    ending.start()
+    words = ["--socket", display.address, "--electrodes", str(TEN), "--port", "0"]
+    status = cli.main(["live", str(calibration), *words])
+    ending.join()
+    display.thread.join(30)
+    printed = capsys.readouterr()
+    said = [line for line in printed.err.splitlines() if line][-1]
+    assert status == ENDS[how][0], said
+    assert ENDS[how][1] in said
+    if how != "hangs up":
+        assert not display.given[-1].any()
+    if status == DONE:
+        assert re.fullmatch(
+            rf"\d+ pulses, 0 incomplete, 0 late blocks, \d pauses?, {SENT}\n", printed.out
+        )
 
 
 def until(browser, expression):
@@ -383,18 +523,21 @@ def fill(name):
     return f"document.querySelector('#value g[data-name={name}] circle').getAttribute('fill')"
 
 
+BAD = "document.getElementById('status').classList.contains('bad')"
+
+
 def test_a_browser_shows_the_skin_and_stops_it():
-    controller, stimulator = controller_of(TEN), Stimulator(TEN)
+    controller, display = controller_of(TEN), Display(TEN)
     with chromium() as browser:
         with LiveView(controller, charge=WANTED, controls=True, port=0) as view:
-            with running(view, stimulator, controller) as (thread, ticks):
+            with running(view, display, controller) as (thread, ticks):
                 browser.open(view.address)
                 until(browser, "state?.pulse > 10 && state.words.every(word => word === 'good')")
                 # The picture changes when the skin does.
                 red = "+{}.match(/\\d+/)[0]".format
                 alike = f"Math.abs({red(fill('E4'))} - {red(fill('E5'))})"
                 assert browser.evaluate(alike) < 20
-                stimulator.skin[3], stimulator.skin[5] = "damp", "open"
+                display.skin[3], display.skin[5] = "damp", "open"
                 until(browser, f"{alike} > 100 && {fill('E6')} === 'white'")
                 alarms = browser.evaluate("document.getElementById('alarms').innerText")
                 assert re.search(r"Pulse \d+: contact lost, at E6", alarms)
@@ -426,19 +569,17 @@ def test_a_browser_shows_the_skin_and_stops_it():
                 browser.evaluate("second.document.getElementById('stop').click()")
                 thread.join(30)
                 assert not thread.is_alive()
-                assert ticks[-1].stopped
-                assert not any(tick.stopped for tick in ticks[:-1])
                 for of in ("", "second."):
-                    until(browser, f"{of}{status}.startsWith('Stopped: no pulse was commanded')")
+                    until(browser, f"{of}{status}.startsWith('Stopped: amplitude 0 was sent')")
                 charges = np.array(browser.evaluate("state.charge"), float)
                 np.testing.assert_allclose(np.delete(charges, 5), 80, rtol=0.05)
             until(browser, f"document.getElementById('stop').disabled && {status} !== ''")
-        stimulator.thread.join(30)
-        given = np.array(stimulator.given)
-        assert (given[:-1].max(axis=1) > 0).all()
-        assert (given[-1] == 0).all(), "the stop is the last that the stimulator is told"
-        assert len(given) == len(ticks) + 1
-        until(browser, f"{status} === 'The program has ended after the stop.'")
+        display.thread.join(30)
+        assert display.positive() >= len(ticks)
+        assert not display.given[-1].any(), "the stop is the last that the stimulator is told"
+        told = "amplitude 0 was sent to all electrodes"
+        until(browser, f"{status} === 'Stopped after pulse {ticks[-1].number + 1}: {told}.'")
+        assert not browser.evaluate(BAD)
         # Another program at the same place: the page asks for its page, and has its token.
         old = browser.evaluate("told.start")
         with LiveView(controller, charge=WANTED, controls=False, port=port_of(view)) as again:

@@ -6,9 +6,11 @@ import contextlib
 import pathlib
 import sys
 
+from etid.circuits.display import several
 from etid.commands import Outcome
 from etid.identify.driver import identify_driver
 from etid.live.loop import follow
+from etid.live.stimulator import SENT, Stimulator
 from etid.live.view import PORT, LiveView
 from etid.online.controller import Controller
 from etid.online.stream import connected, played, received, sender
@@ -54,36 +56,53 @@ def run(arguments: argparse.Namespace) -> Outcome:
     cap = {} if arguments.charge_cap is None else {"charge_cap": arguments.charge_cap}
     controller = Controller.of(tracker, **cap)
     layout = None if arguments.layout is None else read_layout(arguments.layout)
-    send = None
+    rate, stimulator = records[0].sample_rate, None
     with contextlib.ExitStack() as opened:
         if arguments.socket is None:
-            rate = records[0].sample_rate
+            line = None
             blocks = played(arguments.file, arguments.electrodes, rate, arguments.speed)
         else:
             line = opened.enter_context(connected(arguments.socket))
-            blocks = received(line)
-            send = sender(line)
+            blocks = received(line, lambda: stimulator is not None and stimulator.stopped)
         view = opened.enter_context(
             LiveView(
                 controller,
                 charge=arguments.charge,
-                controls=send is not None,
+                controls=line is not None,
                 layout=layout,
                 port=arguments.port,
             )
         )
+        if line is not None:
+            period = tracker.period / rate
+            stimulator = opened.enter_context(
+                Stimulator(sender(line), tracker.electrodes, period, view)
+            )
         print(f"{view.address} shows the display; Ctrl-C ends it", file=sys.stderr, flush=True)
-        ticks = follow(blocks, controller, charge=arguments.charge, send=send, view=view)
-        last = collections.deque(ticks, maxlen=1)
-    if not last:
+        ticks = follow(
+            blocks, controller, charge=arguments.charge, stimulator=stimulator, view=view
+        )
+        last = collections.deque(enumerate(ticks, start=1), maxlen=1)
+        stopped = view.stopped
+    if not (last or stopped):
         raise ValueError("the stream ended before the first pulse")
-    tick = last[0]
+    pulses, tick = last[0] if last else (0, None)
     data = {
         "source": arguments.socket or arguments.file,
-        "pulses": tick.number + 1,
-        "incomplete": tick.missing,
-        "late": tick.late,
-        "stopped": tick.stopped,
+        "pulses": pulses,
+        "incomplete": tick.missing if tick else 0,
+        "late": tick.late if tick else 0,
+        "pauses": stimulator.pauses if stimulator else 0,
+        "stopped": stopped,
     }
-    text = f"{tick.number + 1} pulses, {tick.missing} incomplete, {tick.late} late blocks"
-    return Outcome(text + (", stopped" if tick.stopped else ""), data)
+    text = [several(pulses, "pulse"), f"{data['incomplete']} incomplete"]
+    text.append(several(data["late"], "late block"))
+    if stimulator is not None:
+        text += [several(stimulator.pauses, "pause"), SENT]
+    return Outcome(", ".join(text + ["stopped"] * stopped), data)
+
+
+def after_interrupt(arguments: argparse.Namespace) -> str:
+    """Message after Ctrl-C before or after the display has run."""
+    told = "the last amplitude, if any was sent, is 0"
+    return "nothing was changed" if arguments.socket is None else told

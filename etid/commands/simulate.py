@@ -8,6 +8,7 @@ from etid.circuits.display import several
 from etid.commands import Outcome
 from etid.recordings.replacing import HDF5, replace_text
 from etid.simulation import scenes
+from etid.simulation.displays import ELECTRODES, write_stream
 
 # No recording of any preset is refused by chance, as one in 10 000 is by each test.
 SEED = 2
@@ -39,16 +40,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="also write the true elements, as JSON in SI units",
     )
+    parser.add_argument(
+        "--stream",
+        type=pathlib.Path,
+        metavar="FILE",
+        help="also write pulses of a display with this skin, for etid live --file",
+    )
 
 
 def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
-    """The file of recordings, and that of the true elements."""
+    """The files of recordings, of the true elements and of the stream."""
     truth = {} if arguments.truth is None else {arguments.truth: (".json",)}
-    return {arguments.target: HDF5, **truth}
+    stream = {} if arguments.stream is None else {arguments.stream: HDF5}
+    return {arguments.target: HDF5, **truth, **stream}
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Write the recordings, and the true elements if --truth is given."""
+    """Write the recordings; true elements with --truth; pulses of a display with --stream."""
     scene = scenes.PRESETS[arguments.preset](
         snr_db=arguments.snr_db, trigger_jitter_rms=arguments.jitter
     )
@@ -57,4 +65,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.truth is not None:
         replace_text(arguments.truth, json.dumps(scene.truth(), indent=1) + "\n")
     text = f"{arguments.target}: {several(len(study), 'recording')}"
-    return Outcome(text, {"target": arguments.target, "recordings": len(study)})
+    data = {"target": arguments.target, "recordings": len(study)}
+    if arguments.stream is not None:
+        data["pulses"] = write_stream(scene, arguments.stream, arguments.seed)
+        text += f"\n{arguments.stream}: {data['pulses']} pulses at {ELECTRODES} electrodes"
+    return Outcome(text, data)

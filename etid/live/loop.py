@@ -1,16 +1,19 @@
 """The loop of a display: each pulse is tracked, and the next one commanded, until someone stops."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from etid.live.stimulator import Stimulator
 from etid.live.view import LiveView
 from etid.online.controller import Command, Controller
 from etid.online.state import Change, TrackerState
 from etid.online.stream import Block, Pulses
+
+RESTARTED = "the counter of samples began anew"
 
 
 class Tick(NamedTuple):
@@ -23,7 +26,6 @@ class Tick(NamedTuple):
         state: State after it.
         command: What to give at the next pulse.
         changes: Changes that the pulse has shown.
-        stopped: Whether this is the last pulse, because someone has stopped.
         seconds: Time that the tick took [s].
         missing: Pulses so far without all of their samples.
         late: Blocks so far that came after their pulse was over.
@@ -35,7 +37,6 @@ class Tick(NamedTuple):
     state: TrackerState
     command: Command
     changes: list[Change]
-    stopped: bool
     seconds: float
     missing: int
     late: int
@@ -46,19 +47,19 @@ def follow(
     controller: Controller,
     *,
     charge: float,
-    send: Callable[[Float[np.ndarray, " lane"]], None] | None = None,
+    stimulator: Stimulator | None = None,
     view: LiveView | None = None,
 ) -> Iterator[Tick]:
     """The ticks of a stream, until it ends or someone stops.
 
-    After a stop the amplitude 0 is sent, and no further one.
+    While the display is at rest there are no ticks. After the rest, the tracker begins anew.
 
     Args:
         blocks: The stream.
         controller: The controller of the display.
         charge: Wanted charge per phase [C].
-        send: Gives amplitudes to the stimulator, for the pulse that follows. The display begins at
-            rest. Without it, all pulses have the amplitude of the unloaded record.
+        stimulator: Is sent the amplitudes. Without it, all pulses have the amplitude of the
+            unloaded record.
         view: The page that shows the ticks and can stop.
 
     Raises:
@@ -66,26 +67,39 @@ def follow(
     """
     tracker = controller.tracker
     pulses = Pulses(tracker.period, tracker.model.bands.samples, tracker.electrodes)
-    state, given = tracker.start(at_rest=send is not None), np.ones(tracker.electrodes)
+    at_rest, given = stimulator is not None, np.ones(tracker.electrodes)
+    state = tracker.start(at_rest=at_rest)
     # It compiles here, while nothing waits.
-    controller.command(tracker.update(state, pulses.window, given), charge=charge)
-    if send is not None:
-        given = controller.command(state, charge=charge).amplitude
-        send(given)
+    first = tracker.update(state, pulses.window, given)
+    controller.command(first, charge=charge)
+    tracker.changes(first)
+    last, watched = -1, stimulator or view
     for number, window in pulses.cut(blocks):
+        if watched is not None and watched.stopped:
+            return
         begin = time.perf_counter()
+        if number <= last:
+            state = tracker.start(at_rest=at_rest)
+            if stimulator is not None:
+                stimulator.rest(RESTARTED)
+        last = number
+        if stimulator is not None and stimulator.resting:
+            if stimulator.rested():
+                state = tracker.start(at_rest=True)
+                given = controller.command(state, charge=charge).amplitude
+                stimulator.send(given)
+                if view is not None and stimulator.reason:
+                    text = "amplitude 0 was sent, and stimulation begins anew from rest"
+                    view.note(f"Pulse {number + 1}: {stimulator.reason}: {text}")
+            continue
         before, state = state, tracker.update(state, window, given)
-        command, stopped = controller.command(state, charge=charge), False
-        if view is not None and view.stopped:
-            command, stopped = controller.command(state, charge=0.0), True
-        if send is not None:
+        command = controller.command(state, charge=charge)
+        if stimulator is not None:
             given = command.amplitude
-            send(given)
+            stimulator.send(given)
         changes, seconds = tracker.changes(state), time.perf_counter() - begin
         counts = (pulses.missing, pulses.late)
-        tick = Tick(number, window, before, state, command, changes, stopped, seconds, *counts)
+        tick = Tick(number, window, before, state, command, changes, seconds, *counts)
         if view is not None:
             view.show(tick)
         yield tick
-        if stopped:
-            return

@@ -21,6 +21,8 @@ import numpy as np
 from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 
+from etid.live.output import Output
+
 HEADER = "X-Etid-Token"
 ALIVE = 0.5  # [s] between two looks at the loop's process
 
@@ -29,7 +31,10 @@ class Slot:
     """Memory of two processes for one snapshot, which a newer one replaces.
 
     Attributes:
-        stop: Not 0 after a stop.
+        stopping: Ready to be read after a stop, and after the end of the page's process.
+        press: The other end of `stopping`, for the page's process.
+        pressed: Whether someone has stopped; only the page's process knows.
+        output: What the stimulator gives.
         electrode: Number of the electrode whose pulse is shown.
     """
 
@@ -37,7 +42,9 @@ class Slot:
         self._dtype = dtype
         self._memory = context.RawArray("b", dtype.itemsize)
         self._lock = context.Lock()
-        self.stop = context.RawValue("b", 0)
+        self.stopping, self.press = context.Pipe(duplex=False)
+        self.pressed = False
+        self.output = context.RawValue("b", 0)
         self.electrode = context.RawValue("l", 0)
 
     def put(self, snapshot: np.ndarray, *, wait: bool) -> None:
@@ -90,13 +97,21 @@ class _State(_Handler):
     def get(self) -> None:
         of = self.slot.get()
         shown = {name: _plain(of[name]) for name in of.dtype.names or ()}
-        self.finish(shown | {"start": self.told["start"], "stop": bool(self.slot.stop.value)})
+        stop, output = self.slot.pressed, self.slot.output.value
+        self.finish(shown | {"start": self.told["start"], "stop": stop, "output": output})
 
 
 class _Stop(_Handler):
-    def post(self) -> None:
-        self.slot.stop.value = 1
-        self.finish({})
+    async def post(self) -> None:
+        """Pass the stop on; the answer says whether 0 was sent, after which nothing else is."""
+        if not self.slot.pressed:
+            self.slot.press.send_bytes(b"stop")
+            self.slot.pressed = True
+        for _ in range(100):
+            if self.slot.output.value not in (Output.REST, Output.RUNNING):
+                break
+            await asyncio.sleep(ALIVE / 100)
+        self.finish({"zero": self.slot.output.value == Output.ZERO})
 
 
 class _Electrode(_Handler):

@@ -1,8 +1,9 @@
 """The live view, as the loop sees it: it is given each tick, and says whether someone has stopped.
 
 The page is served by a process of its own, which gets a snapshot ten times a second through a slot
-of fixed size. A newer snapshot replaces an older one, and nothing here waits for a page. If that
-process ends, nobody could stop any more: this counts as a stop.
+of fixed size. A newer snapshot replaces an older one, and nothing here waits for a page. A stop
+comes through a pipe. If that process ends, nobody could stop any more: the end of the pipe is a
+stop, too.
 """
 
 import importlib.util
@@ -11,6 +12,8 @@ import secrets
 import socket
 import time
 from collections import deque
+from multiprocessing.connection import wait
+from types import TracebackType
 from typing import TYPE_CHECKING
 
 import jax
@@ -19,11 +22,13 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.display import DISPLAY, first_of, heading
 from etid.estimators.unknowns import LoadUnknowns
+from etid.live.output import Output
+from etid.live.stimulator import SENT
 from etid.online.controller import Controller
 from etid.online.pulse_fit import GainModel
 from etid.plotting.layout import Layout, like_fingertip
 from etid.precision import in_float64
-from etid.recordings.errors import install
+from etid.recordings.errors import in_one_line, install
 from etid.results.verdicts import verdict_names
 
 if TYPE_CHECKING:
@@ -32,6 +37,7 @@ if TYPE_CHECKING:
 PORT = 8765
 EVERY = 0.1  # [s] between two snapshots
 ALARMS = 12  # alarms that are listed
+SEEN = 1.2  # [s] for windows to see the last snapshot: one in the background asks once a second
 GOOD = "good"  # state of an electrode that needs no alarm
 
 
@@ -40,6 +46,7 @@ class LiveView:
 
     Attributes:
         address: Where a browser of this computer finds it.
+        stopping: Ready to be read as soon as someone has stopped, or nobody can any more.
     """
 
     def __init__(
@@ -88,7 +95,8 @@ class LiveView:
         self._scale = np.array([DISPLAY[unit][0] for unit in units.values()])
         samples = np.arange(of.size)[self._part]
         dtype = [
-            ("pulse", int), ("missing", int), ("late", int), ("slowest", float), ("stopped", bool),
+            ("pulse", int), ("missing", int), ("late", int), ("slowest", float), ("end", "S400"),
+            ("bad", bool),
             ("elements", float, (len(units), number)), ("charge", float, number),
             ("words", "S40", number), ("electrode", int), ("v_out", float, samples.size),
             ("predicted", float, samples.size), ("alarms", "S200", ALARMS),
@@ -118,8 +126,10 @@ class LiveView:
         self._process = context.Process(
             target=serve, args=(listening, self._slot, told), daemon=True
         )
-        with listening:  # the other process has it
+        self.stopping = self._slot.stopping
+        with listening, self._slot.press:  # the other process has both
             self._process.start()
+        self._last: Tick | None = None
         self._due = self._slowest = 0.0
         self._spare = tracker.period / bands.sample_rate / 2
         self._words = ["not identified: too_short"] * number
@@ -129,52 +139,88 @@ class LiveView:
     @property
     def stopped(self) -> bool:
         """Whether someone has stopped, or nobody can any more."""
-        return bool(self._slot.stop.value) or not self._process.is_alive()
+        return bool(wait([self.stopping], 0))
+
+    def told(self, output: Output) -> None:
+        """Tell the page at once what the stimulator gives."""
+        self._slot.output.value = output
+
+    def note(self, alarm: str) -> None:
+        """Note an alarm, which is shown with the next tick."""
+        self._alarms.appendleft(alarm)
 
     def show(self, tick: "Tick") -> None:
-        """Hand over a tick, at most ten times a second, and the last one.
+        """Hand over a tick, at most ten times a second.
 
         A tick that took half of its period is not shown, unless none was shown for a second.
         """
         pulse = f"Pulse {tick.number + 1}: "
         for change in tick.changes:
             text = change.words("" if change.electrode is None else self._names[change.electrode])
-            self._alarms.appendleft(pulse + text)
-        self._slowest = max(self._slowest, tick.seconds)
+            self.note(pulse + text)
+        self._last, self._slowest = tick, max(self._slowest, tick.seconds)
         now = time.monotonic()
-        wait = now < self._due or (tick.seconds > self._spare and now < self._due + 1.0)
-        if wait and not tick.stopped:
-            return
-        self._due = now + EVERY
-        self._alarm(pulse, self._seen(tick))
+        early = now < self._due or (tick.seconds > self._spare and now < self._due + 1.0)
+        if not early:
+            self._due = now + EVERY
+            self._fill(tick)
+            self._slot.put(self._snapshot, wait=False)
+
+    def _fill(self, tick: "Tick") -> None:
+        """Make a tick the snapshot."""
+        self._alarm(tick.number, self._seen(tick))
         state = tick.state.electrodes
         at = min(self._slot.electrode.value, len(self._names) - 1)
         of = self._snapshot[0]
         of["pulse"], of["missing"], of["late"] = tick.number + 1, tick.missing, tick.late
-        of["slowest"], of["stopped"], of["electrode"] = 1e3 * self._slowest, tick.stopped, at
+        of["slowest"], of["electrode"] = 1e3 * self._slowest, at
         own = np.asarray(state.own)
         known = np.asarray(state.pulses) > 0
         of["elements"] = np.where(known, np.exp(own[:, :-1].T) / self._scale[:, None], np.nan)
-        if not tick.stopped:  # its command is 0, which tells no charge of the pulse before
-            of["charge"] = self._given(tick) / 1e-9
+        of["charge"] = self._given(tick) / 1e-9
         of["words"] = [word.encode() for word in self._words]
         of["v_out"] = tick.window[at, self._part]
         of["predicted"] = self._predicted(tick, at)
         texts = [text.encode() for text in self._alarms]
         of["alarms"] = texts + [b""] * (ALARMS - len(texts))
-        self._slot.put(self._snapshot, wait=tick.stopped)
 
-    def close(self) -> None:
-        """End the page, after its windows had the time to see the last snapshot."""
-        time.sleep(0.5 if self._process.is_alive() else 0)
-        self._process.terminate()
-        self._process.join()
+    def close(self, end: str = "The program has ended.", *, bad: bool = False) -> None:
+        """End the page, after its windows had the time to see the last tick and why it is so.
+
+        Args:
+            end: How the display has ended.
+            bad: Whether somebody should look after it.
+        """
+        try:
+            if self._last is not None:
+                self._fill(self._last)
+            of = self._snapshot[0]
+            of["end"], of["bad"] = end.encode(), bad
+            self._slot.put(self._snapshot, wait=True)
+            time.sleep(SEEN if self._process.is_alive() else 0)
+        finally:
+            self._process.terminate()
+            self._process.join()
 
     def __enter__(self) -> "LiveView":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        how, bad = "Stopped" if self.stopped else "The stream has ended", False
+        if error is not None:
+            bad = not isinstance(error, KeyboardInterrupt)
+            how = "An error ended the program" if bad else "Interrupted"
+        after = "before the first pulse"
+        if self._last is not None:
+            after = f"after pulse {self._last.number + 1}"
+        zero = SENT if self._controls else ""
+        said = zero if error is None else in_one_line(error)
+        self.close(f"{how} {after}{': ' * bool(said)}{said.removesuffix('.')}.", bad=bad)
 
     def _compile(self) -> None:
         """Compile what `show` uses, before a pulse waits."""
@@ -193,17 +239,19 @@ class LiveView:
             caps = ("peak", "charge", "guard", "voltage")
             for at in np.flatnonzero(np.isin(tick.command.reason, caps)):
                 words[at] = f"cap reached: {tick.command.reason[at]}"
+        for at in np.flatnonzero(self._given(tick) > float(self._controller.limits.charge_cap)):
+            words[at] = "above the charge cap"
         for at, reason in tracker.bad_electrodes(state).items():
             words[at] = "contact lost" if reason == "open" else reason
         return ["driver changed"] * len(words) if bool(state.driver_changed) else words
 
-    def _alarm(self, pulse: str, words: list[str]) -> None:
+    def _alarm(self, number: int, words: list[str]) -> None:
         """Note the electrodes whose state has become another one that is not good."""
         for word in dict.fromkeys(words):
             new = [at for at, now in enumerate(words) if now == word != self._words[at]]
             if new and word != GOOD:
                 names = first_of([self._names[at] for at in new], 6)
-                self._alarms.appendleft(f"{pulse}{word}, at {names}")
+                self.note(f"Pulse {number + 1}: {word}, at {names}")
         self._words = words
 
     def _given(self, tick: "Tick") -> Float[np.ndarray, " lane"]:

@@ -1,7 +1,8 @@
 """A stream of blocks, and the windows of one pulse that a tracker needs.
 
 A block is the number of its first sample since the start, and the voltages (electrode, sample) [V].
-Blocks that are missing or late cost the pulses that they belong to, which are counted.
+Blocks that are missing or late cost the pulses that they belong to, which are counted. A counter
+of samples that goes back by `PAUSE` periods or more has begun anew: so do the windows.
 """
 
 import dataclasses
@@ -19,7 +20,10 @@ from etid.recordings.errors import RecordingError
 from etid.recordings.untrusted import guarded
 
 BLOCK = 500  # samples of a block that is played back
+PAUSE = 20  # periods that nothing waits for: longer than a computer hesitates, shorter than people
+WAIT = 0.2  # [s] for a stimulator to take amplitudes, and between two looks whether someone stopped
 LARGEST = 10**8  # voltages in a block; a header that says more is out of step
+FARTHEST = 10**15  # samples since the start: thirty years at 1 MHz
 Block = tuple[int, np.ndarray]
 
 
@@ -86,33 +90,49 @@ def connected(address: str) -> socket.socket:
             f"{address} cannot be reached ({error}); start the stimulator, or correct the address"
         ) from error
     line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # amplitudes leave at once
+    line.settimeout(WAIT)
     return line
 
 
-def received(line: socket.socket) -> Iterator[Block]:
+def received(line: socket.socket, stopped: Callable[[], bool] = lambda: False) -> Iterator[Block]:
     """Blocks from a server, until it closes the connection.
 
     A block is a header of three little-endian 64-bit integers (first sample, electrodes, samples),
     then the voltages as float64, electrode by electrode.
 
+    Args:
+        line: Connection to the server.
+        stopped: Whether no more blocks are wanted, which is asked while none comes.
+
     Raises:
         ValueError: A header is out of step.
     """
-    with line.makefile("rb") as stream:
-        while header := stream.read(24):
-            if len(header) < 24:
-                return
-            first, electrodes, samples = (int(one) for one in np.frombuffer(header, "<i8"))
-            if not (0 < electrodes <= LARGEST and 0 < samples <= LARGEST // electrodes):
-                raise ValueError(
-                    f"a block has {several(electrodes, 'electrode')} and "
-                    f"{several(samples, 'sample')}; is its header three little-endian integers of "
-                    "64 bits?"
-                )
-            body = stream.read(8 * electrodes * samples)
-            if len(body) < 8 * electrodes * samples:
-                return
-            yield first, np.frombuffer(body, "<f8").reshape(electrodes, samples)
+
+    def read(size: int) -> bytearray:
+        """So many bytes, or fewer at the end."""
+        found, at = bytearray(size), 0
+        while at < size and not stopped():
+            try:
+                taken = line.recv_into(memoryview(found)[at:])
+            except TimeoutError:
+                continue
+            if not taken:
+                break
+            at += taken
+        return found[:at]
+
+    while len(header := read(24)) == 24:
+        first, electrodes, samples = (int(one) for one in np.frombuffer(header, "<i8"))
+        sized = 0 < electrodes <= LARGEST and 0 < samples <= LARGEST // electrodes
+        if not (sized and 0 <= first < FARTHEST):
+            raise ValueError(
+                f"a block has {several(electrodes, 'electrode')} and {several(samples, 'sample')} "
+                f"from sample {first} on; is its header three little-endian integers of 64 bits?"
+            )
+        body = read(8 * electrodes * samples)
+        if len(body) < 8 * electrodes * samples:
+            return
+        yield first, np.frombuffer(body, "<f8").reshape(electrodes, samples)
 
 
 def sender(line: socket.socket) -> Callable[[Float[np.ndarray, " lane"]], None]:
@@ -152,6 +172,8 @@ class Pulses:
     ) -> Iterator[tuple[int, Float[np.ndarray, "lane sample"]]]:
         """The number of each pulse and its window [V]; what is missing is NaN.
 
+        The numbers increase, but after a counter that has begun anew.
+
         Raises:
             ValueError: A block has another number of electrodes.
         """
@@ -160,7 +182,11 @@ class Pulses:
                 raise ValueError(
                     f"a block has {several(block.shape[0], 'electrode')}, not {self.electrodes}"
                 )
-            if first + block.shape[1] <= self.begin(self.number):
+            behind = self.begin(self.number) - first - block.shape[1]
+            if behind >= PAUSE * self.period:
+                self.number = int(first / self.period)
+                self.window = np.full_like(self.window, np.nan)
+            elif behind >= 0:
                 self.late += 1
                 continue
             lost = int(first / self.period) - self.number - 1

@@ -53,6 +53,12 @@ def _ended(text: str) -> str:
     return text if text.endswith("?") else f"{text}."
 
 
+def in_one_line(error: BaseException) -> str:
+    """What an error and its notes say."""
+    text, *notes = (" ".join(str(one).split()) for one in (error, *getattr(error, "__notes__", ())))
+    return "; ".join([text.rstrip("."), *notes]).removeprefix("; ") if notes else text
+
+
 def require_file(path: str) -> None:
     """Raise an error if a path is not a file that can be read; pipes and devices are not opened."""
     try:
