@@ -1,11 +1,13 @@
 """Identify and control a display of your own, pulse by pulse, with a log.
 
+    etid simulate paper_dry -o calibration.h5 --stream pulses.h5
     python examples/stream_display.py calibration.h5 pulses.h5
     python examples/stream_display.py calibration.h5 pulses.h5 --page
 
 `etid live` follows a file, or a stimulator at a socket. A lab with another source or stimulator, or
 with a log, adapts these lines: `played` becomes its source of blocks (see `etid.online.stream`),
-and `follow(…, send=…)` gets what tells its stimulator the amplitudes. `--page` opens the live view.
+and a `Stimulator` gets what sends amplitudes (see `etid.live.stimulator`). `--page` opens the live
+view.
 
 * The calibration file is an etid study whose calibrations have several periods.
 * The pulses are the dataset `v_out` (electrode, sample) [V] of an HDF5 file, played in real time.
@@ -89,8 +91,9 @@ def run(arguments: argparse.Namespace) -> None:
             print(view.address)
         log = Log(arguments.log, names, electrodes)
         opened.callback(log.file.close)
-        # A recorded file has pulses of constant amplitude. With a stimulator: follow(…, send=send),
-        # and LiveView(…, controls=True).
+        # A recorded file has pulses of constant amplitude. With a stimulator: LiveView(…,
+        # controls=True), then `opened.enter_context(Stimulator(send, electrodes, period, view))`,
+        # which sends 0 when this block ends, and follow(…, stimulator=stimulator).
         for tick in follow(blocks, controller, charge=charge, view=view):
             elements = np.exp(np.asarray(tick.state.electrodes.own))
             log.add(

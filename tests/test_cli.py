@@ -17,6 +17,7 @@ import etid
 from benchmarks.specimens import study_fits
 from etid import cli
 from etid.commands import calibrate, fit, simulate
+from etid.simulation import displays
 from etid.simulation.calibration import CheckedCalibration
 
 DONE, WRONG_DATA, WRONG_USAGE = 0, 1, 2
@@ -253,6 +254,7 @@ TWICE = "--calibration c.csv 1 --calibration c.csv 2"
         ("report study.h5", "run etid fit first"),
         ("simulate paper_dry -o s.h5 --jitter 5", "below half a pulse period"),
         ("simulate paper_dry -o s.h5 --jitter -1", "must not be negative"),
+        ("simulate paper_calibration -o s.h5 --stream p.h5", "no skin for a stream; choose"),
         ("simulate paper_dry -o s.h5 --seed -1", "seed is -1; it must not be negative"),
     ],
 )
@@ -302,6 +304,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
         return CheckedCalibration(driver, [1e-3], {})
 
     monkeypatch.setattr(calibrate, "calibrate", calibrated)
+    monkeypatch.setattr(displays, "REPEATS", 1)
     page = (pathlib.Path(__file__).parents[1] / "docs" / "command_line.md").read_text("utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", page, flags=re.MULTILINE))
     assert rows.keys() == cli.COMMANDS.keys()
@@ -312,7 +315,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
     names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
     rates = ("--sample-rate", 2e5, "--pulse-rate", 60)
     calls = {
-        "simulate": ("paper_dry", "-o", tmp_path / "made.h5"),
+        "simulate": ("paper_dry", "-o", tmp_path / "made.h5", "--stream", tmp_path / "s.h5"),
         "merge": (study_file, "-o", tmp_path / "merged.h5"),
         "check": (study_file,),
         "calibrate": (study_file, "-o", tmp_path / "driver.h5"),

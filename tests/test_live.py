@@ -84,7 +84,8 @@ class Display:
 
     def __init__(self, electrodes):
         self.skin, self.given = ["dry"] * electrodes, []
-        self.silent, self.number, self.raw = False, 0, None
+        self.silent, self.number = False, 0
+        self.raw: bytes | None = None
         self.server = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.server.getsockname()[1]}"
         self.thread = threading.Thread(target=self._run, daemon=True)

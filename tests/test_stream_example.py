@@ -47,6 +47,27 @@ def test_missing_and_late_blocks_are_counted_and_only_their_pulses_suffer():
         list(pulses.cut([(0, np.ones((3, 50)))]))
 
 
+def test_a_counter_that_begins_anew_begins_new_windows():
+    v = np.arange(2 * 2000.0).reshape(2, 2000)
+    pulses, size = stream.Pulses(33.4, 33, 2), 50
+    again = [*blocks(v, size), *blocks(v[:, :500], size)]
+    found = list(pulses.cut(again))
+    numbers = [number for number, _ in found]
+    assert numbers == [*range(59), *range(14)]
+    for number, window in found:
+        begin = round(number * 33.4)
+        np.testing.assert_array_equal(window, v[:, begin : begin + 33])
+    assert (pulses.late, pulses.missing) == (0, 0)
+
+
+def test_a_block_that_is_late_by_less_than_a_pause_is_no_new_beginning():
+    v = np.arange(2 * 2000.0).reshape(2, 2000)
+    pulses, known = stream.Pulses(33.4, 33, 2), list(blocks(v, 50))
+    late = [*known[:30], known[30 - stream.PAUSE // 2], *known[30:]]
+    assert [number for number, _ in pulses.cut(late)] == list(range(59))
+    assert (pulses.late, pulses.missing) == (1, 0)
+
+
 def test_blocks_come_through_a_socket():
     v = np.random.default_rng(0).standard_normal((2, 300))
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -140,20 +161,28 @@ def test_a_stream_that_is_not_there_is_named(tmp_path):
             stream.connected(wrong)
 
 
-def test_a_header_out_of_step_is_refused():
+@pytest.mark.parametrize(
+    ("header", "text"),
+    [
+        (b"\xff" * 24, "-1 electrodes and -1 samples from sample -1 on"),
+        (np.array([-1, 2, 3], "<i8").tobytes(), "2 electrodes and 3 samples from sample -1 on"),
+        (np.array([0, 0, 3], "<i8").tobytes(), "0 electrodes and 3 samples from sample 0 on"),
+    ],
+)
+def test_a_header_out_of_step_is_refused(header, text):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
 
         def serve():
             line, _ = server.accept()
             with line:
-                line.sendall(b"\xff" * 24)
+                line.sendall(header)
 
         thread = threading.Thread(target=serve)
         thread.start()
         with (
             stream.connected(f"127.0.0.1:{port}") as line,
-            pytest.raises(ValueError, match="-1 electrodes and -1 samples"),
+            pytest.raises(ValueError, match=text),
         ):
             next(stream.received(line))
         thread.join()

@@ -61,12 +61,13 @@ def run(arguments: argparse.Namespace) -> Outcome:
         snr_db=arguments.snr_db, trigger_jitter_rms=arguments.jitter
     )
     study = scene.simulate(arguments.seed)
+    streamed = {}
+    if arguments.stream is not None:
+        streamed["pulses"] = write_stream(scene, arguments.stream, arguments.seed)
     study.write(arguments.target)
     if arguments.truth is not None:
         replace_text(arguments.truth, json.dumps(scene.truth(), indent=1) + "\n")
     text = f"{arguments.target}: {several(len(study), 'recording')}"
-    data = {"target": arguments.target, "recordings": len(study)}
-    if arguments.stream is not None:
-        data["pulses"] = write_stream(scene, arguments.stream, arguments.seed)
-        text += f"\n{arguments.stream}: {data['pulses']} pulses at {ELECTRODES} electrodes"
-    return Outcome(text, data)
+    if streamed:
+        text += f"\n{arguments.stream}: {streamed['pulses']} pulses at {ELECTRODES} electrodes"
+    return Outcome(text, {"target": arguments.target, "recordings": len(study), **streamed})
