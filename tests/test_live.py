@@ -8,6 +8,7 @@ import json
 import os
 import pathlib
 import re
+import select
 import signal
 import socket
 import subprocess
@@ -71,11 +72,12 @@ def alone():
 
 
 class Display:
-    """A display at a socket: when it is sent amplitudes, it gives a pulse of them and records it.
+    """A display at a socket: gives and records a pulse of the last amplitudes that it was sent.
 
     Attributes:
         skin: Name of the load at each electrode, which a test may change.
         given: All amplitudes that it was sent.
+        pulses: First sample and amplitudes of all pulses.
         silent: Whether the converter sends nothing.
         number: Number of the next pulse.
         raw: Bytes to send in place of the next block; none: the connection is closed.
@@ -83,7 +85,7 @@ class Display:
     """
 
     def __init__(self, electrodes):
-        self.skin, self.given = ["dry"] * electrodes, []
+        self.skin, self.given, self.pulses = ["dry"] * electrodes, [], []
         self.silent, self.number = False, 0
         self.raw: bytes | None = None
         self.server = socket.create_server(("127.0.0.1", 0))
@@ -93,13 +95,13 @@ class Display:
 
     def _run(self):
         pulses, noise = alone(), np.random.default_rng(0)
-        with self.server, self.server.accept()[0] as line, line.makefile("rb") as stream:
+        with self.server, self.server.accept()[0] as line:
             before, self.line = np.zeros(len(self.skin)), line
             with contextlib.suppress(ConnectionError):
-                while len(told := stream.read(8 * len(self.skin))) == 8 * len(self.skin):
+                while told := line.recv(8 * before.size, socket.MSG_WAITALL):
                     now = np.frombuffer(told, "<f8")
                     self.given.append(now)
-                    if self.silent:
+                    if self.silent or select.select([line], [], [], 0)[0]:
                         continue
                     if self.raw is not None:
                         if not self.raw:
@@ -112,6 +114,7 @@ class Display:
                     v += NOISE * noise.standard_normal(v.shape)
                     begin = round(self.number * PERIOD)
                     line.sendall(np.array([begin, *v.shape], "<i8").tobytes() + v.tobytes())
+                    self.pulses.append((begin, now))
                     before, self.number = now, self.number + 1
                     time.sleep(0.01)
 
@@ -231,7 +234,8 @@ def test_only_the_loopback_address_is_listened_at(view):
 
 def test_alarms_are_words():
     tracker = tracker_of(TEN, 3e-3)
-    changes = [Change(1, 4, "jump", "r_p", 0.0937), Change(1, None, "driver", "", np.nan)]
+    changes = [Change(1, at, "jump", "r_p", factor) for at, factor in ((4, 0.0937), (5, 0.0941))]
+    changes += [Change(1, 7, "drift", "c_p", 1.2), Change(1, None, "driver", "", np.nan)]
     with opened() as view:
         view.show(tick_of(tracker, 6, changes, reason="charge"))
         found = shown(view)
@@ -240,8 +244,38 @@ def test_alarms_are_words():
     assert [text for text in found["alarms"] if text] == [
         "Pulse 7: cap reached: charge, at E1, E2, E3, E4, E5, E6 and 4 more",
         "Pulse 7: the driver has changed; calibrate again",
-        "Pulse 7: jump of r_p, to 0.094 times its value, at E5",
+        "Pulse 7: drift of c_p, to 1.2 times its value, at E8",
+        "Pulse 7: jump of r_p, to 0.094 times its value, at E5, E6",
     ]
+
+
+def test_an_electrode_that_was_never_identified_has_no_elements():
+    tick = tick_of(tracker_of(TEN, 3e-3))
+    pulses = jnp.zeros(TEN, int).at[2].set(1)
+    electrodes = dataclasses.replace(tick.state.electrodes, pulses=pulses)
+    with opened() as view:
+        view.show(tick._replace(state=dataclasses.replace(tick.state, electrodes=electrodes)))
+        found = np.array(shown(view)["elements"], float)  # null becomes NaN
+    assert (np.isfinite(found) == (np.arange(TEN) == 2)).all(), found
+
+
+def test_a_pulse_above_the_cap_between_two_snapshots_is_an_alarm():
+    controller = controller_of(TEN, charge_cap=120e-9)
+    tracker = controller.tracker
+    tick = tick_of(tracker)
+    ones = dataclasses.replace(tick.state.electrodes, amplitude=jnp.ones(TEN))
+    state = dataclasses.replace(tick.state, electrodes=ones)
+    command = dataclasses.replace(tick.command, charge=np.full(TEN, 80e-9))
+    above = dataclasses.replace(command, charge=np.where(np.arange(TEN) == 3, 200e-9, 80e-9))
+    with LiveView(controller, charge=WANTED, controls=True, port=0) as view:
+        for number, of in enumerate((command, above, command)):
+            view._due = 0.0 if number != 1 else np.inf
+            view.show(tick._replace(number=number, state=state, command=of))
+        found = shown(view)
+        assert found["alarms"][0] == "Pulse 3: above the charge cap, at E4"
+        view._due = 0.0
+        view.show(tick._replace(number=3, state=state, command=command))
+        assert "above the charge cap" not in shown(view)["words"]
 
 
 @pytest.mark.parametrize(
@@ -428,11 +462,14 @@ def test_a_pause_and_a_counter_that_begins_anew_cost_a_rest_and_stop_is_obeyed_i
             wait_for(lambda text=text: any(text in alarm for alarm in shown(view)["alarms"]))
         display.silent = True
         assert json.loads(stop(view)[1]) == {"zero": True}
-        assert not display.given[-1].any()
+        wait_for(lambda: not display.given[-1].any(), seconds=5)  # it was sent, and has to be read
         thread.join(30)
         assert not thread.is_alive()
     display.thread.join(30)
     assert not display.given[-1].any()
+    assert not any(tick.state.driver_changed for tick in ticks)
+    given = dict(display.pulses)[round(ticks[-1].number * PERIOD)]
+    np.testing.assert_array_equal(ticks[-1].state.electrodes.amplitude, given)
     pulses = [int(tick.state.electrodes.pulses.max()) for tick in ticks]
     assert sum(now < before for before, now in itertools.pairwise(pulses)) >= 2, "it begins anew"
 
@@ -524,6 +561,7 @@ def fill(name):
     return f"document.querySelector('#value g[data-name={name}] circle').getAttribute('fill')"
 
 
+STATUS = "document.getElementById('status').textContent"
 BAD = "document.getElementById('status').classList.contains('bad')"
 
 
@@ -531,8 +569,10 @@ def test_a_browser_shows_the_skin_and_stops_it():
     controller, display = controller_of(TEN), Display(TEN)
     with chromium() as browser:
         with LiveView(controller, charge=WANTED, controls=True, port=0) as view:
+            browser.open(view.address)
+            until(browser, f"{STATUS} === 'waiting for the first pulse'")
+            assert browser.evaluate(fill("E4")) == "white"
             with running(view, display, controller) as (thread, ticks):
-                browser.open(view.address)
                 until(browser, "state?.pulse > 10 && state.words.every(word => word === 'good')")
                 # The picture changes when the skin does.
                 red = "+{}.match(/\\d+/)[0]".format
@@ -563,33 +603,46 @@ def test_a_browser_shows_the_skin_and_stops_it():
                 # A second window stops both.
                 opened = "void (globalThis.second = window.open(location.href))"
                 browser.call("Runtime.evaluate", expression=opened, userGesture=True)
-                status = "document.getElementById('status').textContent"
-                until(browser, f"second.{status}.startsWith('pulse ')")
+                until(browser, f"second.{STATUS}.startsWith('pulse ')")
                 assert browser.complaints == []
                 assert {url.rpartition("/")[0] for url in browser.requests} == {view.address}
                 browser.evaluate("second.document.getElementById('stop').click()")
                 thread.join(30)
                 assert not thread.is_alive()
                 for of in ("", "second."):
-                    until(browser, f"{of}{status}.startsWith('Stopped: amplitude 0 was sent')")
+                    until(browser, f"{of}{STATUS}.startsWith('Stopped: amplitude 0 was sent')")
                 charges = np.array(browser.evaluate("state.charge"), float)
                 np.testing.assert_allclose(np.delete(charges, 5), 80, rtol=0.05)
-            until(browser, f"document.getElementById('stop').disabled && {status} !== ''")
+            until(browser, f"document.getElementById('stop').disabled && {STATUS} !== ''")
         display.thread.join(30)
         assert display.positive() >= len(ticks)
         assert not display.given[-1].any(), "the stop is the last that the stimulator is told"
         told = "amplitude 0 was sent to all electrodes"
-        until(browser, f"{status} === 'Stopped after pulse {ticks[-1].number + 1}: {told}.'")
+        until(browser, f"{STATUS} === 'Stopped after pulse {ticks[-1].number + 1}: {told}.'")
         assert not browser.evaluate(BAD)
         # Another program at the same place: the page asks for its page, and has its token.
         old = browser.evaluate("told.start")
         with LiveView(controller, charge=WANTED, controls=False, port=port_of(view)) as again:
             again.show(tick_of(controller.tracker))
             until(browser, f"told.start !== '{old}' && state?.pulse === 1")
-            assert "watching only" in browser.evaluate(status)
+            assert "watching only" in browser.evaluate(STATUS)
             browser.evaluate("act('electrode', '7')")
             for _ in range(100):
                 if again._slot.electrode.value == 7:
                     break
                 time.sleep(0.1)
             assert again._slot.electrode.value == 7
+        until(browser, f"{STATUS} === 'The stream has ended after pulse 1.'")
+        assert not browser.evaluate(BAD), "the end of a file is no alarm"
+
+        def fail():
+            port = port_of(again)
+            with LiveView(controller, charge=WANTED, controls=True, port=port):
+                until(browser, f"{STATUS} === 'waiting for the first pulse'")
+                raise ValueError("no reader.")
+
+        with pytest.raises(ValueError, match="no reader"):
+            fail()
+        how = "An error ended the program before the first pulse"
+        until(browser, f"{STATUS} === '{how}: no reader.'")
+        assert browser.evaluate(BAD)

@@ -72,7 +72,6 @@ def test_without_a_new_amplitude_the_display_rests_and_then_begins_anew():
         assert not stimulator.send(HALF)
         zeros = len(sent)
         until(lambda: len(sent) > zeros)  # 0 is repeated
-        assert not stimulator.rested(), "what has waited in the line is no new pulse"
         begun(stimulator)
         assert stimulator.send(HALF)
         stimulator.rest("the counter went back")
@@ -81,11 +80,25 @@ def test_without_a_new_amplitude_the_display_rests_and_then_begins_anew():
         assert (stimulator.pauses, stimulator.reason) == (2, "the counter went back")
 
 
+def test_a_pulse_that_waited_in_the_line_does_not_end_a_rest():
+    """A rest of 200 s, at whose end pulses follow each other faster than in real time."""
+    with Stimulator(lambda _: None, 2, 10.0) as stimulator:
+        assert not stimulator.rested()
+        assert stimulator._since is not None
+        stimulator._since -= 201.0
+        stimulator._before -= 1.0
+        assert not stimulator.rested()
+        stimulator._before -= 6.0
+        assert stimulator.rested()
+
+
 @pytest.mark.parametrize("how", ["STOP", "the page's process has ended"])
 def test_a_stop_is_obeyed_at_once_also_while_the_loop_is_busy(how):
     sent, view = [], View()
     with Stimulator(lambda of: sent.append(of[0]), 2, 100.0, view) as stimulator:
-        stimulator._since = -1e9  # the rest is over; a pause would take half an hour
+        stimulator._since = (
+            stimulator._before
+        ) = -1e9  # the rest is over; a pause would take half an hour
         begun(stimulator)
         stimulator.send(HALF)
         view.press.send_bytes(b"stop") if how == "STOP" else view.press.close()
@@ -102,7 +115,7 @@ def test_nothing_but_0_follows_a_stop_in_a_race():
     for _ in range(20):
         sent, view = [], View()
         with Stimulator(lambda of, sent=sent: sent.append(of[0]), 2, PERIOD, view) as stimulator:
-            stimulator._since = -1e9
+            stimulator._since = stimulator._before = -1e9
             begun(stimulator)
             assert stimulator.send(HALF)
             stopper = threading.Timer(1e-3, view.press.send_bytes, (b"stop",))
@@ -197,7 +210,7 @@ from etid.live.stimulator import Stimulator
 signal.signal(signal.SIGINT, signal.default_int_handler)
 how = sys.argv[1]
 with Stimulator(lambda of: os.write(1, b"%g\\n" % of[0]), 2, 2e-3 if how != "busy" else 5.0) as one:
-    one._since = -1e9
+    one._since = one._before = -1e9
     while not one.rested():
         pass
     one.send(np.full(2, 0.5))

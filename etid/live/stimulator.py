@@ -11,8 +11,8 @@ come. A thread of its own therefore sends the zeros, and everything that is sent
 - If no new amplitude is sent for `PAUSE` periods, 0 is sent, and the display is at rest again. It
   does not matter why: silence of the converter, blocks that belong to no pulse, a loop that hangs.
 - At rest 0 is repeated every `PAUSE` periods, and no other amplitude is sent. The rest ends with a
-  pulse that comes `PAUSE` periods after the first one of this rest. So nothing that waited in the
-  line is taken for a new pulse.
+  pulse that comes `PAUSE` periods after the first one of this rest, and half a period after the one
+  before. So no pulse that waited in the line is taken for one of the amplitudes that follow.
 - After a stop 0 is sent at once, and no other amplitude any more. STOP of the page, the end of the
   page's process, and the signals that end a program are stops.
 - Whatever leaves the `with` block, 0 is sent first.
@@ -76,10 +76,12 @@ class Stimulator:
         view: Watched | None = None,
     ) -> None:
         self._send, self._view, self._zero = send, view, np.zeros(electrodes)
-        self._pause = PAUSE * period
+        self._period, self._pause = period, PAUSE * period
         self._lock = threading.Lock()
         self._guarded = False  # while the caller's thread sends
-        self._due, self._since = 0.0, None
+        self._due = 0.0
+        self._since: float | None = None  # the first pulse of this rest
+        self._before = 0.0  # and the last one
         self._lost: Exception | None = None
         self._signal: int | None = None
         self._numbers = set[int]()  # of the signals that are stops
@@ -125,8 +127,10 @@ class Stimulator:
         """Whether the rest is over with the pulse that has come; if so, amplitudes are sent."""
         with self._unbroken():
             now = time.monotonic()
-            self._since = now if self._since is None else self._since
-            if self.stopped or now - self._since < self._pause:
+            if self._since is None:
+                self._since = self._before = now
+            waited, self._before = now - self._before, now
+            if self.stopped or now - self._since < self._pause or waited < self._period / 2:
                 return False
             self.resting, self._due = False, now + self._pause
             self._tell(Output.RUNNING)

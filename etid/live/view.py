@@ -39,6 +39,8 @@ EVERY = 0.1  # [s] between two snapshots
 ALARMS = 12  # alarms that are listed
 SEEN = 1.2  # [s] for windows to see the last snapshot: one in the background asks once a second
 GOOD = "good"  # state of an electrode that needs no alarm
+NEW = "not identified: too_short"  # of an electrode before its first pulse, which is no alarm
+DRIVER = "driver changed"  # of all electrodes, which has an alarm of its own
 
 
 class LiveView:
@@ -132,7 +134,8 @@ class LiveView:
         self._last: Tick | None = None
         self._due = self._slowest = 0.0
         self._spare = tracker.period / bands.sample_rate / 2
-        self._words = ["not identified: too_short"] * number
+        self._words = [NEW] * number
+        self._above = np.zeros(number, bool)  # the charge cap, since the last snapshot
         self._alarms: deque[str] = deque(maxlen=ALARMS)
         self._compile()
 
@@ -154,17 +157,16 @@ class LiveView:
 
         A tick that took half of its period is not shown, unless none was shown for a second.
         """
-        pulse = f"Pulse {tick.number + 1}: "
-        for change in tick.changes:
-            text = change.words("" if change.electrode is None else self._names[change.electrode])
-            self.note(pulse + text)
+        self._note_changes(tick)
         self._last, self._slowest = tick, max(self._slowest, tick.seconds)
+        self._above |= self._given(tick) > float(self._controller.limits.charge_cap)
         now = time.monotonic()
         early = now < self._due or (tick.seconds > self._spare and now < self._due + 1.0)
         if not early:
             self._due = now + EVERY
             self._fill(tick)
             self._slot.put(self._snapshot, wait=False)
+            self._above[:] = False
 
     def _fill(self, tick: "Tick") -> None:
         """Make a tick the snapshot."""
@@ -239,17 +241,27 @@ class LiveView:
             caps = ("peak", "charge", "guard", "voltage")
             for at in np.flatnonzero(np.isin(tick.command.reason, caps)):
                 words[at] = f"cap reached: {tick.command.reason[at]}"
-        for at in np.flatnonzero(self._given(tick) > float(self._controller.limits.charge_cap)):
+        for at in np.flatnonzero(self._above):
             words[at] = "above the charge cap"
         for at, reason in tracker.bad_electrodes(state).items():
             words[at] = "contact lost" if reason == "open" else reason
-        return ["driver changed"] * len(words) if bool(state.driver_changed) else words
+        return [DRIVER] * len(words) if bool(state.driver_changed) else words
+
+    def _note_changes(self, tick: "Tick") -> None:
+        """Note the changes that a pulse has shown: those that are alike as one alarm."""
+        found: dict[str, list[str]] = {}
+        for change in tick.changes:
+            names = found.setdefault(change.words("{}"), [])
+            if change.electrode is not None:
+                names.append(self._names[change.electrode])
+        for text, names in found.items():
+            self.note(f"Pulse {tick.number + 1}: {text.format(first_of(names, 6))}")
 
     def _alarm(self, number: int, words: list[str]) -> None:
         """Note the electrodes whose state has become another one that is not good."""
         for word in dict.fromkeys(words):
             new = [at for at, now in enumerate(words) if now == word != self._words[at]]
-            if new and word != GOOD:
+            if new and word not in (GOOD, NEW, DRIVER):
                 names = first_of([self._names[at] for at in new], 6)
                 self.note(f"Pulse {number + 1}: {word}, at {names}")
         self._words = words
