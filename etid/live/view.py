@@ -251,6 +251,8 @@ class LiveView:
         """Note the changes that a pulse has shown: those that are alike as one alarm."""
         found: dict[str, list[str]] = {}
         for change in tick.changes:
+            if change.kind == "driver" and tick.before.driver_changed:
+                continue  # it is known
             names = found.setdefault(change.words("{}"), [])
             if change.electrode is not None:
                 names.append(self._names[change.electrode])
