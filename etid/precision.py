@@ -1,4 +1,8 @@
-"""float64 for all that etid computes and keeps, whatever the process has set for JAX."""
+"""The settings of JAX for all that etid computes and keeps, whatever the process has set.
+
+Precision is float64. NaN and infinity are results here: elements of a fit that failed have no
+number, and its verdict says why. So `jax_debug_nans` and `jax_debug_infs` do not look into etid.
+"""
 
 import functools
 from collections.abc import Callable
@@ -14,7 +18,7 @@ Result = TypeVar("Result")
 
 
 def in_float64(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """The function, run in float64. The rest of the process keeps its precision.
+    """The function, run in float64, with NaN as a result. The process keeps its own settings.
 
     Raises:
         RuntimeError: JAX traces the function in float32, for a derivative or for `jax.jit`. The
@@ -23,15 +27,17 @@ def in_float64(function: Callable[Parameters, Result]) -> Callable[Parameters, R
 
     @functools.wraps(function)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if is_float64():
+        config: Any = jax.config  # its attributes are made at run time
+        looks = config.jax_debug_nans or config.jax_debug_infs
+        if is_float64() and not looks:
             return function(*args, **kwargs)
-        if is_traced((args, kwargs)):
+        if not is_float64() and is_traced((args, kwargs)):
             raise RuntimeError(
                 "etid needs float64, and JAX traces this call in float32. Before making JAX arrays,"
                 ' call\n    jax.config.update("jax_enable_x64", True)\n'
                 "or set the environment variable JAX_ENABLE_X64=1."
             )
-        with jax.enable_x64(True):
+        with jax.enable_x64(True), jax.debug_nans(False), jax.debug_infs(False):
             return function(*args, **kwargs)
 
     return call

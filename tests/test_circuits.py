@@ -66,7 +66,7 @@ def test_the_circuits_of_etid_are_public():
 
 def test_a_negative_resistance_is_not_repaired():
     assert float(resistor(-50.0)(jnp.array(1j)).real) == -50.0
-    assert bool(jnp.isnan(SkinRC(-1.0, 1.0, 1.0).log_values()[0]))
+    assert bool(jnp.isnan(SkinRC.of_fit([-1.0, 1.0, 1.0]).log_values()[0]))
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 0.85, 1.0])

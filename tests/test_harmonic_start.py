@@ -19,7 +19,7 @@ SKINS = {
 SETTLED = 20  # iterations
 SUMS = 1e-2  # straight lines between the knots; one step of a fit corrects a hundredth
 FREQUENCY = 60.0 * jnp.arange(1.0, 1667.0)
-Z_TH = SOURCE.response(FREQUENCY)
+Z_TH = jnp.asarray(SOURCE.response(FREQUENCY))
 RATE = jnp.asarray(200e3)
 start = jax.jit(lambda of, steps: start_of_skin(of, Z_TH, RATE, steps), static_argnums=1)
 

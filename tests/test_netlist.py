@@ -133,7 +133,7 @@ BATCH = etid.SkinRC(np.ones(3), np.ones(3), np.ones(3))
         ),
         (lambda: etid.netlist(etid.SkinCole(alpha=1.02)), r"exponent is 1\.02; no passive network"),
         (lambda: etid.netlist(etid.SkinRC(1.0, 1.0, np.nan)), "c_p is nan"),
-        (lambda: etid.circuit_string(etid.SkinRC(-1.0, 1.0, 1.0)), "r_s is -1"),
+        (lambda: etid.circuit_string(etid.SkinRC.of_fit([-1.0, 1.0, 1.0])), "r_s is -1"),
         (lambda: etid.netlist(BATCH), r"is a batch; give one circuit, such as fits\[0\]"),
         (lambda: etid.circuit_string(BATCH), r"is a batch; give one circuit, such as fits\[0\]"),
     ],

@@ -82,7 +82,8 @@ etid.register(etid.SteiglitzMcBride(iterations=3)) -> is the name of SteiglitzMc
 etid.identify_amplitudes([of.alone], circuit=Twice()) -> 2 resistors that depend on their current
 etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 2.0]) -> shape
 etid.identify_impedance([0.0, 2.0, 3.0], [1.0, 2.0, 3.0]) -> frequency must be
-etid.identify_impedance([1.0, 2.0, 3.0], [1.0, np.nan, 3.0]) -> 1 impedance of 3 not finite
+etid.identify_impedance([1.0, 2.0, 3.0], [1.0, np.nan, 3.0])
+    -> 1 impedance of 3 missing or not finite
 etid.identify_impedance([1.0], [1.0]) -> cannot determine 3 elements
 etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 0.0, 3.0]) -> impedance is 0
 dataclasses.replace(of.fit, method='output_error').posterior(of.skin, of.driver)
@@ -152,8 +153,10 @@ etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=np.nan)) -> r_
 etid.identify_study(of.study, method='equation_error', fixed={'r_s': 1.0}) -> no known elements
 etid.identify_study(of.study, circuit='R0-p(R1') -> 'R0\-p\(R1' is no circuit: it ends too early
 etid.identify_skin(of.skin, circuit='R0-R0') -> has R0 twice
-etid.identify_skins([of.skin], circuit='SkinRC') -> circuit: is str 'SkinRC', must be
-etid.identify_impedance([1.0], [1j], circuit='auto') -> circuit: is str 'auto', must be
+etid.identify_skins([of.skin], circuit='SkinRC')
+    -> circuit: 'SkinRC' is a class of circuits; pass a circuit, as in etid.SkinRC\(\)
+etid.identify_impedance([1.0], [1j], circuit='auto')
+    -> circuit='auto' chooses for recordings, not for an impedance
 samples(of, circuit='R0-') -> 'R0\-' is no circuit
 etid.select_circuit(of.skin, candidates=['R0', 'R1']) -> holds R0 and R1, which have the
 [IdentificationError]

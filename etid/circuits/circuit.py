@@ -9,10 +9,12 @@ and netlist.
 import abc
 import dataclasses
 import functools
+from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
@@ -30,8 +32,10 @@ from etid.circuits.elements import (
 )
 from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
 from etid.circuits.overview import Overview, Overviewed, element_rows
-from etid.numpy_tier.tiers import program
+from etid.numpy_tier.tiers import in_numpy, program
 from etid.precision import Module
+from etid.signals.harmonics import namespace
+from etid.signals.missing import unmasked
 from etid.signals.transfer import frequency_variable
 
 _Same = TypeVar("_Same", bound="AbstractCircuit")
@@ -62,7 +66,7 @@ def _numbers(value: Any) -> Any:
     """The value of a parameter as an array of NumPy, which has float64 in every process."""
     if isinstance(value, jax.Array):
         return value
-    numbers = np.asarray(value)
+    numbers = np.asarray(unmasked(value))
     return numbers.astype(float) if numbers.dtype.kind in "biu" else numbers
 
 
@@ -84,6 +88,22 @@ class AbstractCircuit(_Titled, Overviewed, Module):
     @abc.abstractmethod
     def impedance(self) -> AbstractImpedance:
         """Impedance [Ω] as a function of s [rad/s], built from elements."""
+
+    def __check_init__(self) -> None:
+        """Refuse an element that is 0 or negative. NaN is one that is not known."""
+        for name in self.names():
+            value = getattr(self, name)
+            if isinstance(value, jax.core.Tracer) or not np.any(np.asarray(value) <= 0):
+                continue
+            raise ValueError(
+                f"{name} of {type(self).__name__} is {np.min(value):g}; the elements of a circuit "
+                "must be positive"
+            )
+
+    @classmethod
+    def of_fit(cls: type[_Same], numbers: Iterable[Any]) -> _Same:
+        """A circuit of the results of a fit, in the order of `names`: they may be 0 or negative."""
+        return jax.tree.unflatten(jax.tree.structure(cls()), list(numbers))
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -109,21 +129,21 @@ class AbstractCircuit(_Titled, Overviewed, Module):
         }
         return jnp.array([powers[unit] for unit in cls.units().values()]).T
 
-    @program
-    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
+    @in_numpy
+    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
         """Impedance Z(j 2π f).
 
         Args:
             frequency: Real frequencies [Hz].
 
         Returns:
-            Impedance [Ω] at each frequency.
+            Impedance [Ω] at each frequency, an array of NumPy outside of transformations of JAX.
         """
-        return self.impedance()(frequency_variable(jnp.asarray(frequency)))
+        return self.impedance()(frequency_variable(jnp.asarray(frequency, float)))
 
-    @program
+    @in_numpy
     def values(self) -> Float[Array, "*lane parameter"]:
-        """Parameters in SI units."""
+        """Parameters in SI units, as an array of NumPy outside of transformations of JAX."""
         return jnp.stack([getattr(self, name) for name in self.names()], axis=-1)
 
     @program
@@ -131,7 +151,9 @@ class AbstractCircuit(_Titled, Overviewed, Module):
         """Natural logarithms of the parameters in SI units."""
         return jnp.log(self.values())
 
-    def with_log_values(self: _Same, log_values: Float[Array, "*lane parameter"]) -> _Same:
+    def with_log_values(
+        self: _Same, log_values: Float[Array | np.ndarray, "*lane parameter"]
+    ) -> _Same:
         """A circuit of the same class with other parameters.
 
         Args:
@@ -140,7 +162,7 @@ class AbstractCircuit(_Titled, Overviewed, Module):
         Returns:
             A new circuit; this circuit does not change.
         """
-        return self.with_values(jnp.exp(log_values))
+        return self.with_values(namespace(log_values).exp(log_values))
 
     def with_values(self: _Same, values: Float[Array | np.ndarray, "*lane parameter"]) -> _Same:
         """A circuit of the same class with these parameters in SI units."""
@@ -252,7 +274,7 @@ class SkinRC(AbstractCircuit):
         return series(resistor(self.r_s), parallel(resistor(self.r_p), capacitor(self.c_p)))
 
     @property
-    @program
+    @in_numpy
     def f_c(self) -> Float[Array, "..."]:
         """Corner frequency 1 / (2π R_p C_p) [Hz]."""
         return 1 / (2 * jnp.pi * jnp.asarray(self.r_p * self.c_p))

@@ -97,7 +97,7 @@ def imported(name: str) -> type[AbstractCircuit]:
     Args:
         name: `Class` for a circuit of etid, a circuit string, or `module:Class`.
     """
-    if is_circuit_string(name):
+    if is_circuit_string(name) or re.search(r"[-(,]", name):  # no name has these characters
         return class_of(name)
     module, _, attribute = name.rpartition(":")
     if not module:
@@ -157,6 +157,10 @@ def circuit(string: str) -> AbstractCircuit:
     Raises:
         ValueError: The string is not a circuit, or an element occurs twice.
     """
+    for kind in _defined():
+        if kind.__name__.lower() == string.strip().lower() and kind.__module__ != STRINGS:
+            name = f"{'etid.' if kind.__module__.startswith('etid.') else ''}{kind.__name__}"
+            raise ValueError(f"{string!r} is a class of circuits; pass a circuit, as in {name}()")
     return class_of(string)()
 
 
@@ -224,10 +228,14 @@ def _blank(string: str) -> AbstractCircuit:
 
 
 def _refuse(string: str, at: int) -> NoReturn:
-    cause = f"cannot read {string[at:]!r}" if string[at:] else "it ends too early"
+    kind = re.compile("|".join(sorted(_ELEMENTS, reverse=True))).match(string, at)
+    rest = string[at:] if kind is None else string[kind.end() :]
+    cause = f"cannot read {rest!r}" if rest else "it ends too early"
+    if kind is not None:
+        cause += f", where the number of {kind[0]} must be"
     raise ValueError(
-        f"{string!r} is no circuit: {cause}; write R, C, L or "
-        "CPE with a number, '-' for series and 'p(…,…)' for parallel, as in 'R0-p(R1,C1)'"
+        f"{string!r} is no circuit: {cause}; write R, C, L or CPE with a number, '-' for series "
+        "and 'p(…,…)' for parallel, as in 'R0-p(R1,C1)'"
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.display import several
-from etid.circuits.lookup import circuit, is_circuit_string
+from etid.circuits.lookup import circuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import Known
 from etid.recordings.errors import not_recorded
@@ -144,11 +144,13 @@ def given_circuit(field: str, value: Any) -> AbstractCircuit:
     """The given circuit, or that of a circuit string.
 
     Raises:
-        RecordingError: The value is not a circuit; a class of circuits, for instance.
-        ValueError: The circuit string cannot be read.
+        RecordingError: The value is not a circuit, or the circuit string cannot be read.
     """
-    if isinstance(value, str) and is_circuit_string("".join(value.split())):
-        return circuit(value)
+    if isinstance(value, str):
+        try:
+            return circuit(value)
+        except ValueError as error:
+            raise RecordingError(str(error), field=field) from None
     require(field, value, AbstractCircuit)
     return cast(AbstractCircuit, value)
 
@@ -228,15 +230,20 @@ def known_elements(
     fixed, prior = dict(fixed or {}), dict(prior or {})
     for name in fixed.keys() & prior.keys():
         raise RecordingError(f"{name} is fixed and has a prior", field="prior", remedy="Remove one")
-    try:
-        known = [(str(name), float(value), 0.0) for name, value in fixed.items()]
-        known += [(str(name), float(mean), float(std)) for name, (mean, std) in prior.items()]
-    except (TypeError, ValueError):
-        raise RecordingError(
-            "must be numbers [SI]",
-            field="prior" if prior else "fixed",
-            remedy='Pass fixed={"r_s": 500.0} or prior={"r_s": (500.0, 50.0)}',
-        ) from None
+    known = [
+        (str(name), number_of(f"fixed[{name!r}]", value), 0.0) for name, value in fixed.items()
+    ]
+    for name, told in prior.items():
+        try:
+            mean, error = told
+        except (TypeError, ValueError):
+            raise RecordingError(
+                f"is {reprlib.repr(told)}, must be a value and its standard deviation",
+                field=f"prior[{name!r}]",
+                remedy='Pass prior={"r_s": (500.0, 50.0)} [SI]',
+            ) from None
+        mean, error = (number_of(f"prior[{name!r}]", one) for one in (mean, error))
+        known.append((str(name), mean, error))
     return tuple(known)
 
 

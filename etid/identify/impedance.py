@@ -17,6 +17,7 @@ Without standard errors the residual alone says whether the circuit is right; `_
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -30,14 +31,22 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.branches import in_order
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several
-from etid.identify.arguments import circuit_of
-from etid.identify.kramers_kronig import EXACT, FAIL, MISFIT_CHI2, kramers_kronig
+from etid.estimators.element_prior import Known, checked
+from etid.identify.arguments import circuit_of, known_elements
+from etid.identify.kramers_kronig import (
+    EXACT,
+    FAIL,
+    MISFIT_CHI2,
+    checked_spectrum,
+    kramers_kronig,
+)
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.remarks import Remark, texts
 from etid.results.data import MeasuredImpedance, with_data
+from etid.results.driver import AUTO
 from etid.results.fit import Fit, IdentificationError, Support, complex_rrse
-from etid.results.verdicts import RESULTS, first_verdict, message, verdict
+from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.solvers.matrices import inverse
 
@@ -62,13 +71,19 @@ def _fit(
     z: Complex[Array, " frequency"],
     noise: Float[Array, " frequency"] | PassiveFit,
     circuit: AbstractCircuit,
+    free: tuple[int, ...],
 ) -> Fit:
     passive = noise if isinstance(noise, PassiveFit) else None
     sigma = None if isinstance(noise, PassiveFit) else noise
     known = passive is None
 
-    def residual(q: Float[Array, " element"], _) -> Float[Array, " part"]:
-        fitted = circuit.with_log_values(q).response(frequency)
+    rows, told = np.array(free), jnp.asarray(circuit.log_values())
+
+    def elements(q: Float[Array, " free"]) -> Float[Array, " element"]:
+        return told.at[rows].set(q)
+
+    def residual(q: Float[Array, " free"], _) -> Float[Array, " part"]:
+        fitted = circuit.with_log_values(elements(q)).response(frequency)
         missed = jnp.log(fitted / z) if sigma is None else (fitted - z) / sigma.astype(z.dtype)
         return jnp.concatenate([missed.real, missed.imag])
 
@@ -86,6 +101,7 @@ def _fit(
 
     def from_corner(faster: Float[Array, ""]) -> optx.Solution:
         starts = (typical - of_time * faster)[None, :] + levels[:, None] * of_level[None, :]
+        starts = starts[:, rows]
         q0 = best_start(lambda q: residual(q, None), starts)
         solver = LevenbergMarquardt()
         return optx.least_squares(residual, solver, q0, max_steps=500, throw=False)
@@ -102,20 +118,23 @@ def _fit(
     else:
         cov, excess = _judged(residual(q, None), jax.jacfwd(residual)(q, None), passive)
         misfit, remark = excess > FAIL, jnp.where(excess > EXACT, int(Remark.not_noise), 0)
-    places = in_order(circuit, q)
-    q, cov = q[places], cov[places][:, places]
-    fitted = circuit.with_log_values(q)
-    values = fitted.values()
+    if len(free) == len(circuit.names()):  # a fixed element names its branch
+        places = in_order(circuit, q)
+        q, cov = q[places], cov[places][:, places]
+    # Fixed elements are as they were told, to the last digit.
+    values = jnp.asarray(circuit.values()).at[rows].set(jnp.exp(q))
+    fitted = circuit.with_values(values)
+    cov = jnp.zeros((values.size, values.size)).at[np.ix_(rows, rows)].set(cov)
     settled = solution.result == optx.RESULTS.successful
     terms = jnp.asarray(2.0 * z.size)
     support = dataclasses.replace(  # no changes of the circuit are tested
-        Support.unknown(q.size), deviance=2 * equations.objective, terms=terms
+        Support.unknown(values.size), deviance=2 * equations.objective, terms=terms
     )
     return Fit(
         circuit=fitted,
         cov=cov * jnp.outer(values, values),
         shared_cov=jnp.zeros_like(cov),
-        rrse=complex_rrse(fitted.response(frequency), z),
+        rrse=complex_rrse(jnp.asarray(fitted.response(frequency)), z),
         chi2=chi2 if known else jnp.asarray(jnp.nan),
         result=first_verdict(
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
@@ -129,6 +148,23 @@ def _fit(
         remarks=remark,
         support=support if known else None,
     )
+
+
+def _held(circuit: AbstractCircuit, known: Known) -> tuple[AbstractCircuit, tuple[int, ...]]:
+    """The circuit with its fixed elements, and the numbers of the free ones.
+
+    Raises:
+        ValueError: The circuit has no such element, a value is not positive, or none is free.
+    """
+    checked(known, circuit)
+    values, names = np.array(circuit.values()), circuit.names()
+    for name, value, _ in known:
+        values[names.index(name)] = value
+    held = {name for name, *_ in known}
+    free = tuple(row for row, name in enumerate(names) if name not in held)
+    if not free:
+        raise ValueError("fixed holds every element; leave at least one free")
+    return circuit.with_values(values), free
 
 
 def _judged(
@@ -196,6 +232,7 @@ def identify_impedance(
     *,
     stderr: float | npt.ArrayLike | None = None,
     circuit: AbstractCircuit | str | None = None,
+    fixed: Mapping[str, float] | None = None,
     throw: bool = True,
 ) -> Fit:
     """Identify a circuit from its impedance.
@@ -209,6 +246,8 @@ def identify_impedance(
             of |Z|, and else widens the standard errors, with the remark `not_noise`.
         circuit: Structure of the circuit, or a circuit string; `SkinRC` if not given. Its values
             matter little.
+        fixed: Known values of elements by name [SI], as in `{"alpha_1": 0.9}`. Their standard
+            errors are 0.
         throw: Raise an error if the verdict is not successful.
 
     Returns:
@@ -216,39 +255,28 @@ def identify_impedance(
 
     Raises:
         ValueError: The shapes of the arrays differ, there are too few impedances for the elements,
-            or a number is not finite or not positive where it must be.
+            a number is missing, not finite or not positive where it must be, or `fixed` is not of
+            this circuit, or leaves no element free.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    structure = circuit_of(circuit)
-    f, z = np.asarray(frequency, float), np.asarray(impedance, complex)
-    sigma = None if stderr is None else np.broadcast_to(np.asarray(stderr, float), f.shape)
-    if f.ndim != 1 or z.shape != f.shape:
+    if isinstance(circuit, str) and circuit == AUTO:
         raise ValueError(
-            f"frequency has shape {f.shape} and impedance {z.shape}; both must be (n,)"
+            "circuit='auto' chooses for recordings, not for an impedance; fit each candidate, and "
+            "compare verdict and chi2"
         )
-    if 2 * f.size <= len(structure.names()):
-        given, wanted = several(f.size, "impedance"), several(len(structure.names()), "element")
+    f, z, sigma = checked_spectrum(frequency, impedance, stderr)
+    structure, free = _held(circuit_of(circuit), known_elements(fixed, None))
+    if 2 * f.size <= len(free):
+        given, wanted = several(f.size, "impedance"), several(len(free), "element")
         raise ValueError(f"{given} cannot determine {wanted}")
-    for name, values in {"frequency": f, "stderr": sigma}.items():
-        if values is not None and not (np.isfinite(values).all() and (values > 0).all()):
-            raise ValueError(f"{name} must be finite and > 0 everywhere")
-    if not np.isfinite(z).all():
-        bad = several(int(np.sum(~np.isfinite(z))), "impedance")
-        raise ValueError(f"{bad} of {z.size} not finite; fit the others")
-    if sigma is None and not z.all():
-        raise ValueError("impedance is 0 somewhere; leave it out, or give stderr")
     rising = np.argsort(f, kind="stable")  # neighbours are compared
-    noise = (
-        _passive_fit(f[rising], z[rising], len(structure.names()))
-        if sigma is None
-        else sigma[rising]
-    )
+    noise = _passive_fit(f[rising], z[rising], len(free)) if sigma is None else sigma[rising]
     put = jax.device_put
-    fit = jax.device_get(_fit(put(f[rising]), put(z[rising]), put(noise), structure))
+    fit = jax.device_get(_fit(put(f[rising]), put(z[rising]), put(noise), structure, free))
     if fit.verdict != "successful":
         fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | int(_remarks(z))))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))
     if throw and fit.verdict != "successful":
-        causes = " ".join([message(fit.verdict), *texts(int(fit.remarks))])
+        causes = " ".join([fit.note, *texts(int(fit.remarks))])
         raise IdentificationError(f"impedance: {fit.verdict}. {causes}", fit)
     return fit

@@ -21,8 +21,10 @@ import scipy
 from jaxtyping import Complex, Float
 
 from etid.circuits.display import per_cent, rounded, several
+from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
 from etid.precision import in_float64
+from etid.signals.missing import unmasked
 
 MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
 EXACT = 1e-4  # relative residual that is as good as none
@@ -108,19 +110,13 @@ def kramers_kronig(
         Residuals and verdict.
 
     Raises:
-        ValueError: The shapes differ, a number is not finite, a frequency or a standard error is
-            not positive, or there are fewer than five frequencies, or than three in each decade.
+        ValueError: As in `identify_impedance`, or there are fewer than five frequencies, or than
+            three in each decade.
     """
-    f, z = np.asarray(frequency, float), np.asarray(impedance, complex)
-    if f.ndim != 1 or z.shape != f.shape or f.size < 5:
-        raise ValueError(
-            f"frequency has shape {f.shape} and impedance {z.shape}; both must be (n,), n ≥ 5"
-        )
-    if not (np.isfinite(z).all() and np.isfinite(f).all() and (f > 0).all()):
-        raise ValueError("all numbers must be finite, and all frequencies > 0")
-    sigma = np.abs(z) if stderr is None else np.broadcast_to(np.asarray(stderr, float), f.shape)
-    if not (np.isfinite(sigma).all() and (sigma > 0).all()):
-        raise ValueError("stderr must be finite and > 0 everywhere")
+    f, z, known = checked_spectrum(frequency, impedance, stderr)
+    if f.size < 5:
+        raise ValueError(f"frequency has shape {f.shape}; both must be (n,), n ≥ 5")
+    sigma = np.abs(z) if known is None else known
     decades = np.log10(f.max() / f.min())
     if f.size < _SPARSE * decades:
         raise ValueError(
@@ -147,6 +143,50 @@ def kramers_kronig(
     by_chance = float(scipy.special.chdtri(degrees[chosen], 1e-3)) / degrees[chosen]
     limit = max(MISFIT_CHI2, by_chance)
     return KramersKronig(f, fitted, residual, chosen + 1, squares[chosen], limit)
+
+
+def checked_spectrum(
+    frequency: npt.ArrayLike, impedance: npt.ArrayLike, stderr: float | npt.ArrayLike | None
+) -> tuple[
+    Float[np.ndarray, " frequency"],
+    Complex[np.ndarray, " frequency"],
+    Float[np.ndarray, " frequency"] | None,
+]:
+    """Frequencies, impedances and standard errors of a caller, one for each frequency.
+
+    Raises:
+        ValueError: The shapes differ, an impedance is missing or not finite, a frequency or a
+            standard error is not positive, or without standard errors an impedance is 0.
+    """
+    f, z = _numbers("frequency", frequency, float), _numbers("impedance", impedance, complex)
+    sigma = None if stderr is None else _numbers("stderr", stderr, float)
+    if f.ndim != 1 or z.shape != f.shape:
+        raise ValueError(
+            f"frequency has shape {f.shape} and impedance {z.shape}; both must be (n,)"
+        )
+    if sigma is not None and sigma.shape not in ((), f.shape):
+        raise ValueError(
+            f"stderr has shape {sigma.shape}; give one number, or one for each of {f.size} "
+            "frequencies"
+        )
+    for name, values in {"frequency": f, "stderr": sigma}.items():
+        if values is not None and not (np.isfinite(values).all() and (values > 0).all()):
+            raise ValueError(f"{name} must be finite and > 0 everywhere")
+    if not np.isfinite(z).all():
+        bad = several(int(np.count_nonzero(~np.isfinite(z))), "impedance")
+        raise ValueError(f"{bad} of {z.size} missing or not finite; fit the others")
+    if sigma is None and not z.all():
+        raise ValueError("impedance is 0 somewhere; leave it out, or give stderr")
+    return f, z, None if sigma is None else np.broadcast_to(sigma, f.shape)
+
+
+def _numbers(name: str, given: float | npt.ArrayLike, kind: type) -> np.ndarray:
+    """The numbers of a caller as an array of float or complex numbers."""
+    found = np.asarray(unmasked(given))
+    if found.dtype.kind not in ("iuf" if kind is float else "iufc"):
+        words = "real numbers" if kind is float else "complex numbers"
+        raise ValueError(f"{name} has dtype {found.dtype}, must be {words}")
+    return found.astype(kind)
 
 
 def _fitted(

@@ -190,7 +190,6 @@ def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
 
     Raises:
         RecordingError: The value is neither a linear circuit nor `"auto"`.
-        ValueError: The circuit string cannot be read.
     """
     if isinstance(value, str) and value == AUTO:
         return usual_circuits()

@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
@@ -18,13 +19,14 @@ from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
 from etid.signals.harmonics import whole_periods
+from etid.signals.missing import unmasked
 from etid.signals.noise import Measurement, noise
 
 
 @in_float64
 def identify_samples(
-    v_th: Float[Array, " time"],
-    v_out: Float[Array, " time"],
+    v_th: Float[Array | np.ndarray, " time"],
+    v_out: Float[Array | np.ndarray, " time"],
     driver: Driver,
     *,
     sample_rate: float,
@@ -68,7 +70,7 @@ def identify_samples(
         check_default(estimator, options.circuits)
     estimator.check_driver(driver, sample_rate)
     v_th, v_out, step, rate = (
-        jnp.asarray(value, float) for value in (v_th, v_out, resolution, sample_rate)
+        jnp.asarray(unmasked(value), float) for value in (v_th, v_out, resolution, sample_rate)
     )
     # The noise is a median: by its derivative, few samples would have most of the weight.
     of_th, of_out = (jax.lax.stop_gradient(jnp.asarray(noise(v, step))) for v in (v_th, v_out))

@@ -78,7 +78,7 @@ def program(
     NumPy runs it on a processor. XLA compiles it in these cases:
 
     - It is part of a transformation (`jax.grad`, `jax.vmap`, `jax.jit`).
-    - A setting of JAX looks into it (`jax_disable_jit`, `jax_debug_nans`, `jax_debug_infs`).
+    - `jax_disable_jit` is set.
     - The default device is no processor.
     - It is a batch.
     - It has a primitive that NumPy cannot run, as your own circuit may have.
@@ -124,6 +124,23 @@ def program(
     return call
 
 
+def in_numpy(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A `program` for a user's arrays: outside of a trace they become arrays of NumPy.
+
+    An array of JAX in float64 falls to float32 in the first operation of a process that has not set
+    `jax_enable_x64`.
+    """
+    run = program(function)
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        found = run(*args, **kwargs)
+        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(found))
+        return found if traced else jax.device_get(found)
+
+    return call
+
+
 def _known(options: dict[str, Any]) -> dict[str, Any]:
     """Those of the options that this version of XLA has; others would end the compilation."""
     return {name: value for name, value in options.items() if _is_known(name, value)}
@@ -145,10 +162,9 @@ def worth_compiling(fits: int, harmonics: bool = True) -> bool:
 
 
 def _by_numpy() -> bool:
-    """Whether NumPy may run programs: on a processor, and no setting of JAX looks into them."""
+    """Whether NumPy may run programs: on a processor, unless JAX runs each operation alone."""
     config: Any = jax.config  # its attributes are made at run time
-    looks = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs
-    return jax.default_backend() == "cpu" and not looks
+    return jax.default_backend() == "cpu" and not config.jax_disable_jit
 
 
 def _by_xla(run: Any, static: _Static, arrays: Any) -> Any:

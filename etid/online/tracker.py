@@ -78,6 +78,7 @@ from etid.results.fit import Fit, IdentificationError
 from etid.results.fits import Fits
 from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
+from etid.signals.missing import unmasked
 
 # A window has faults that a record of several periods has not, and others have other remedies.
 NOTES = {
@@ -178,7 +179,7 @@ class Tracker(Overviewed, Kept):
             circuit_of(circuit),
             bands,
             known,
-            driver.source.response(rate - bands.frequency),
+            jnp.asarray(driver.source.response(rate - bands.frequency)),
             projection.freedom(),
         )
         return cls(
@@ -280,7 +281,7 @@ class Tracker(Overviewed, Kept):
         Returns:
             The windows [V]. Samples after the last whole window are left out.
         """
-        return cut(np.asarray(v_out), self.period)
+        return cut(np.asarray(unmasked(v_out)), self.period)
 
     @in_float64
     def update(
@@ -315,7 +316,7 @@ class Tracker(Overviewed, Kept):
                 f"v_out has shape {np.shape(v_out)}; one period at each electrode has the shape "
                 f"(electrode, sample) = {expected} (Tracker.pulses cuts longer records)"
             )
-        v_out = np.asarray(v_out)
+        v_out = np.asarray(unmasked(v_out))
         if v_out.dtype.kind != "f":
             raise RecordingError(
                 f"has dtype {v_out.dtype}, must be voltages as real numbers",
@@ -391,7 +392,7 @@ def for_each(name: str, given: Any, electrodes: int) -> Float[np.ndarray, " lane
     Raises:
         ValueError: A number is negative or not finite, or there is not one for each electrode.
     """
-    found = np.asarray(given, float)
+    found = np.asarray(unmasked(given), float)
     if found.shape not in ((), (electrodes,)):
         raise ValueError(
             f"{name} has shape {found.shape}; give one number, or one for each of {electrodes} "

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 from matplotlib.axes import Axes
@@ -107,7 +108,7 @@ def frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> N
 
 def _with_errors(
     thing: Impedance, frequency: Float[Array, " frequency"]
-) -> tuple[Complex[Array, " frequency"], Float[Array | np.ndarray, "2 frequency"]]:
+) -> tuple[Complex[Array | np.ndarray, " frequency"], Float[Array | np.ndarray, "2 frequency"]]:
     """Z, and standard errors of ln |Z| and of the phase [rad]; NaN without a covariance."""
     if isinstance(thing, Fit):
         errors = _of_circuit(thing.circuit, jax.device_put(thing.cov), frequency)
@@ -127,6 +128,7 @@ def _of_circuit(
     kind, names = type(circuit), circuit.names()
 
     def response(values: Float[Array, " parameter"]) -> Complex[Array, " frequency"]:
-        return kind(**{name: values[i] for i, name in enumerate(names)}).response(frequency)
+        circuit = kind(**{name: values[i] for i, name in enumerate(names)})
+        return jnp.asarray(circuit.response(frequency))
 
-    return log_stderr(response, circuit.values(), cov)
+    return log_stderr(response, jnp.asarray(circuit.values()), cov)

@@ -12,6 +12,7 @@ from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import RecordingError, located, optional, require_file
 from etid.recordings.tables import rows_of
+from etid.signals.missing import unmasked
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -33,7 +34,7 @@ class Layout(Overviewed):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise RecordingError(f"a layout has these electrodes twice: {', '.join(twice)}")
-        x, y = (np.asarray(of, float) for of in (self.x, self.y))
+        x, y = (np.asarray(unmasked(of), float) for of in (self.x, self.y))
         if not x.shape == y.shape == (len(names),) or not np.isfinite([x, y]).all():
             raise RecordingError(
                 f"a layout needs a finite place for each electrode; {len(names)} electrodes have x "

@@ -34,6 +34,7 @@ from etid.recordings.fields import (
     real,
 )
 from etid.recordings.splitting import split
+from etid.signals.missing import unmasked
 from etid.signals.noise import printed_step
 from etid.signals.pulse_train import find_pulses
 
@@ -48,7 +49,8 @@ class Samples(Overviewed):
     value = conversion · stored + offset                    (NWB, TimeSeries)
 
     Attributes:
-        stored: Integer converter codes or real numbers, in their own dtype; read-only.
+        stored: Integer converter codes or real numbers, in their own dtype; read-only. Samples
+            under the mask of a masked array are NaN, codes with them real numbers.
         conversion: SI units per stored unit.
         offset: Value of a stored zero, in the SI unit.
     """
@@ -63,7 +65,7 @@ class Samples(Overviewed):
         conversion: SupportsFloat = 1.0,
         offset: SupportsFloat = 0.0,
     ) -> None:
-        array = np.asarray(stored)
+        array = np.asarray(unmasked(stored))
         if array.dtype.kind not in "iuf" or array.dtype.itemsize > 8:
             raise RecordingError(
                 f"has dtype {array.dtype}, must be integers or real numbers of at most 64 bits"
@@ -255,7 +257,7 @@ class Recording(Overviewed, AbstractFields):
         """
         with located(path=self.path):
             cause = self.v_th if trigger is None else self.samples[self.cause].values
-            given = None if trigger is None else np.asarray(trigger, float)
+            given = None if trigger is None else np.asarray(unmasked(trigger), float)
             parts = split(cause, self.sample_rate, self.pulse_rate, given).whole
         whole = self.path or self.metadata.kind
         return [

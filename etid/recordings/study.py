@@ -14,6 +14,7 @@ from etid.circuits.display import several
 from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.recordings.fields import LABELS, Given, Label, Metadata, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
+from etid.signals.missing import unmasked
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -331,7 +332,7 @@ def _trials(
     v_th: npt.ArrayLike, v_out: npt.ArrayLike, path: str, fields: Mapping[str, Any]
 ) -> list[Recording]:
     """One recording for each row of `v_out`."""
-    th, out = np.asarray(v_th), np.asarray(v_out)
+    th, out = np.asarray(unmasked(v_th)), np.asarray(unmasked(v_out))
     if out.ndim == 1 and path.startswith("calibration"):
         return [Recording(th, out, path=path, **fields)]
     rows = np.atleast_2d(out)

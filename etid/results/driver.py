@@ -15,13 +15,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.display import per_cent, plus_minus, quality, rounded, several
+from etid.circuits.impedance import Quantity
 from etid.circuits.overview import Overview, Overviewed
-from etid.numpy_tier.tiers import program
+from etid.numpy_tier.tiers import in_numpy
 from etid.precision import Module
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import texts
 from etid.recordings.study import Study
-from etid.results.feed import AbstractFeed, SourceImpedance
+from etid.results.feed import AbstractFeed, Load, SourceImpedance
 from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS, message
 from etid.signals.harmonics import Spectrum
@@ -177,38 +178,35 @@ class Driver(AbstractFeed):
         drawn = importlib.import_module("etid.plotting")  # a higher layer
         return drawn.plot(self, calibration, axes=axes, size=size, title=title)
 
-    @program
-    def gain(
-        self, load: Complex[Array, "*lane frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, "*lane frequency"]:
+    @in_numpy
+    def gain(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
         """H = Z_L / (Z_L + Z_th)."""
-        return load * reciprocal(load + self.response(frequency))
+        z_load = jnp.asarray(load)
+        return z_load * reciprocal(z_load + self.response(frequency))
 
-    def sensitivity(
-        self, load: Complex[Array, "*lane frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, "*lane frequency"]:
+    @in_numpy
+    def sensitivity(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
         """∂ ln H / ∂ ln Z_L = Z_th / (Z_L + Z_th)."""
         z_th = self.response(frequency)
-        return z_th * reciprocal(load + z_th)
+        return z_th * reciprocal(jnp.asarray(load) + z_th)
 
     @abc.abstractmethod
-    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
+    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
         """Source impedance Z_th(j 2π f) [Ω], in continuous time if the method gives it.
 
         Args:
             frequency: Real frequencies [Hz].
+
+        Returns:
+            Impedance, an array of NumPy outside of transformations of JAX.
         """
 
     @abc.abstractmethod
-    def log_response_stderr(
-        self, frequency: Float[Array | np.ndarray, " frequency"]
-    ) -> Float[Array, "2 frequency"]:
+    def log_response_stderr(self, frequency: Quantity) -> Float[Array, "2 ..."]:
         """Standard errors of ln |Z_th| and of the phase [rad]; NaN if there is no covariance."""
 
-    @program
-    def response_stderr(
-        self, frequency: Float[Array | np.ndarray, " frequency"]
-    ) -> Float[Array, " frequency"]:
+    @in_numpy
+    def response_stderr(self, frequency: Quantity) -> Float[Array, "..."]:
         """Standard error of |Z_th|, from the derivatives of |Z_th| by its parameters.
 
         Args:
@@ -264,18 +262,16 @@ class Driver(AbstractFeed):
 class DiscreteDriver(Driver):
     """A driver from Steiglitz-McBride: Z_th is the discrete filter `b`, `a` (paper, eq. 4)."""
 
-    @program
-    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
+    @in_numpy
+    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
         """Source impedance Z_th [Ω] of the discrete filter at real frequencies [Hz]."""
-        z = delay_variable(jnp.asarray(frequency), self.sample_rate)
+        z = delay_variable(jnp.asarray(frequency, float), self.sample_rate)
         return Rational(self.b, self.a)(z)
 
-    @program
-    def log_response_stderr(
-        self, frequency: Float[Array | np.ndarray, " frequency"]
-    ) -> Float[Array, "2 frequency"]:
+    @in_numpy
+    def log_response_stderr(self, frequency: Quantity) -> Float[Array, "2 ..."]:
         """NaN: Steiglitz-McBride gives no covariance."""
-        return jnp.full((2, frequency.size), jnp.nan)
+        return jnp.full((2, *jnp.asarray(frequency, float).shape), jnp.nan)
 
 
 class ContinuousDriver(Driver):
@@ -333,23 +329,23 @@ class ContinuousDriver(Driver):
         """Standard deviation of the delay of the calibrations [samples at this rate, in Hz]."""
         return self.calibration.delay_std_samples * (sample_rate / self.sample_rate)
 
-    @program
-    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
+    @in_numpy
+    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
         """Source impedance Z_th [Ω] in continuous time at real frequencies [Hz]."""
         return self.source.response(frequency)
 
-    @program
-    def log_response_stderr(
-        self, frequency: Float[Array | np.ndarray, " frequency"]
-    ) -> Float[Array, "2 frequency"]:
+    @in_numpy
+    def log_response_stderr(self, frequency: Quantity) -> Float[Array, "2 ..."]:
         """Standard errors of ln |Z_th| and of its phase [rad] at real frequencies [Hz].
 
         var = J cov Jᵀ,    J = ∂(ln |Z_th|, arg Z_th) / ∂parameters
         """
-        z_th, slopes = self.source.with_slopes(jnp.asarray(frequency))
+        at = jnp.asarray(frequency, float)
+        z_th, slopes = self.source.with_slopes(at.ravel())
         relative = slopes * reciprocal(z_th)[None, :]
         parts = jnp.stack([relative.real, relative.imag])
-        return jnp.sqrt(jnp.einsum("cif,ij,cjf->cf", parts, self.cov, parts))
+        variance = jnp.einsum("cif,ij,cjf->cf", parts, self.cov, parts)
+        return jnp.sqrt(variance).reshape(2, *at.shape)
 
     def _numbers(self) -> str:
         if self.verdict == "resistors_disagree":

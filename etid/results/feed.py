@@ -22,13 +22,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from etid.circuits.impedance import realise
+from etid.circuits.impedance import Quantity, realise
 from etid.circuits.overview import Overview
-from etid.numpy_tier.tiers import program
+from etid.numpy_tier.tiers import in_numpy
 from etid.precision import Module
 from etid.results.verdicts import RESULTS, Judged, verdict
 from etid.signals.filtering import StateSpace
 from etid.signals.transfer import Rational, as_complex
+
+Load = Complex[Array, "..."] | Complex[np.ndarray, "..."]
+"""Type of the impedance of a load [Ω]."""
 
 
 class AbstractFeed(Judged):
@@ -41,9 +44,7 @@ class AbstractFeed(Judged):
     recorded: ClassVar[str]
 
     @abc.abstractmethod
-    def gain(
-        self, load: Complex[Array, "*lane frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, "*lane frequency"]:
+    def gain(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
         """H: V_out per input.
 
         Args:
@@ -52,9 +53,7 @@ class AbstractFeed(Judged):
         """
 
     @abc.abstractmethod
-    def sensitivity(
-        self, load: Complex[Array, "*lane frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, "*lane frequency"]:
+    def sensitivity(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
         """∂ ln H / ∂ ln Z_L.
 
         Args:
@@ -87,11 +86,11 @@ class SourceImpedance(Module):
         """Number of poles."""
         return 2 * self.log_omega.shape[0] + self.log_omega_real.shape[0]
 
-    @program
-    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
+    @in_numpy
+    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
         """Impedance [Ω] at real frequencies [Hz]."""
         # In real arithmetic, which takes half the time to compile and to run.
-        omega = 2 * jnp.pi * jnp.asarray(frequency)[None]
+        omega = 2 * jnp.pi * jnp.asarray(frequency, float)[None]
 
         def each(values: Float[Array, " pole"]) -> Float[Array, "pole ..."]:
             return values.reshape(-1, *[1] * (omega.ndim - 1))
@@ -220,16 +219,12 @@ class MeasuredCurrent(AbstractFeed):
     source: CurrentSource = dataclasses.field(default_factory=CurrentSource)
     result: RESULTS = dataclasses.field(default_factory=lambda: verdict("successful"))
 
-    def gain(
-        self, load: Complex[Array, "*lane frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, "*lane frequency"]:
+    def gain(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
         """H = Z_L [Ω]."""
         del frequency
-        return load
+        return jnp.asarray(load)
 
-    def sensitivity(
-        self, load: Complex[Array, "*lane frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, "*lane frequency"]:
+    def sensitivity(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
         """1: the voltage is proportional to the impedance."""
         del frequency
         return jnp.ones_like(load)

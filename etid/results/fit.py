@@ -226,8 +226,7 @@ class Fit(Judged, HasSource[Circuit]):
         cov = xp.asarray(self.cov)
         variance = xp.diagonal(cov, axis1=-2, axis2=-1)
         values = xp.sqrt(xp.where(variance >= 0, variance, xp.nan))
-        values = xp.moveaxis(values, -1, 0)
-        errors = type(self.circuit)(**dict(zip(self.circuit.names(), values, strict=True)))
+        errors = type(self.circuit).of_fit(xp.moveaxis(values, -1, 0))
         return errors.titled(f"Standard errors of {type(errors).__name__}")
 
     @property
@@ -352,9 +351,15 @@ class Fit(Judged, HasSource[Circuit]):
 
     @property
     def missed(self) -> str:
-        """A sentence on the test that a `misfit` has failed, with its size; for one fit."""
+        """A sentence on the test that a `misfit` has failed, with its size; for one fit.
+
+        Empty without a test and without χ², as of a spectrum without standard errors.
+        """
         looks = "" if self.support is None else self.support.looks_like()
-        return looks or f"chi2 is {rounded(float(self.chi2), 3)}; noise alone gives 1."
+        chi2 = float(self.chi2)
+        return looks or (
+            "" if np.isnan(chi2) else f"chi2 is {rounded(chi2, 3)}; noise alone gives 1."
+        )
 
     @property
     def other_circuit(self) -> str:
@@ -393,7 +398,8 @@ class Fit(Judged, HasSource[Circuit]):
         doubtful = self.verdict in ("misfit", "inconsistent", "max_steps_reached")
         doubt = "Is what was told right, and in SI units?" if doubtful and self._told[1] else ""
         driver = "" if self.driver is None or self.verdict == "successful" else self.driver.why
-        return [*filter(None, (self.other_circuit, message(self.verdict), own, doubt, driver))]
+        text = message(self.verdict, self.method == "impedance")
+        return [*filter(None, (self.other_circuit, text, own, doubt, driver))]
 
     def _rows(self) -> list[tuple[str, str, str]]:
         values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())

@@ -342,8 +342,8 @@ class Fits(Overviewed, Generic[Circuit]):
             RecordingError: A column or an attribute is missing or invalid.
         """
         kind, fields, labels, notes = columns_of(table, circuit)
-        numbers = {name: fields.pop(name) for name in kind.names()}
-        return Fits(Fit(circuit=kind(**numbers), **fields), labels, notes)
+        elements = kind.of_fit([fields.pop(name) for name in kind.names()])
+        return Fits(Fit(circuit=elements, **fields), labels, notes)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a damaged file

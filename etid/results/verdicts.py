@@ -192,9 +192,36 @@ def own_part(verdict: str, note: str) -> str:
     return " ".join((note.replace(common, " ") if common else note).split())
 
 
+# A spectrum has no periods, no driver and no choice of method, so its remedies are others.
+_OF_SPECTRUM = {
+    "misfit": (
+        "The circuit misses the impedance by more than its noise. Fit another circuit, and look at "
+        "the residual. Or is the impedance disturbed? etid.kramers_kronig tests it."
+    ),
+    "max_steps_reached": (
+        "The iteration did not converge; the fit reports the best iterate. Fit a simpler circuit, "
+        "or hold an element that is known (fixed)."
+    ),
+    "nonphysical": (
+        "An element is not a number, or an exponent exceeds 1. Fit a capacitor in place of the "
+        "constant-phase element, and check the unit of the impedance and the sign of its imaginary "
+        "part."
+    ),
+    "insensitive": (
+        "The impedance does not determine a parameter: its standard error exceeds its value. "
+        "Measure at more frequencies, fit a simpler circuit, or hold an element (fixed)."
+    ),
+}
+
+
 @functools.cache
-def message(name: str) -> str:
-    """Meaning and remedy of a verdict; empty for `successful`."""
+def message(name: str, spectrum: bool = False) -> str:
+    """Meaning and remedy of a verdict, of a fit to a measured spectrum if this is set.
+
+    It is empty for `successful`.
+    """
+    if spectrum and name in _OF_SPECTRUM:
+        return _OF_SPECTRUM[name]
     if name == "max_steps_reached":  # lineax recommends an argument that etid does not have
         return (
             "The iteration did not converge; the fit reports the best iterate. "

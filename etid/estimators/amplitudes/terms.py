@@ -111,7 +111,7 @@ class Amplitudes(eqx.Module):
 
     def priors(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Terms of the priors."""
-        own = self.circuit.log_values()
+        own = jnp.asarray(self.circuit.log_values())
         own = own if self.prior is None else self.prior.placed(own)
         centre = jnp.concatenate([self.start(own), self.given.mean])
         return (q - centre[: q.size]) / self.widths(q)
@@ -149,7 +149,9 @@ class Amplitudes(eqx.Module):
             return Norton(x, jnp.zeros_like(x))
         gain = self.gain(spectrum)
         near = self.given.z_th(gain.w(gain.split(own)[2]))
-        admittance = reciprocal(self.feed.response(frequency).at[1 : known + 1].set(near))
+        admittance = reciprocal(
+            jnp.asarray(self.feed.response(frequency)).at[1 : known + 1].set(near)
+        )
         return Norton(x * admittance, admittance)
 
     def port(self, own: Float[Array, " own"], spectrum: Spectrum) -> tuple[Port, Float[Array, ""]]:
