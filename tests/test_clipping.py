@@ -1,15 +1,16 @@
-"""Clipping without a known range: found where a pulse is cut, and nowhere else."""
+"""Clipping in a converter or an amplifier: found where a pulse is cut, and nowhere else."""
 
 import numpy as np
 import pytest
 
+import etid
 from benchmarks.laboratory import Output, noise
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.signals.clipping import is_clipped
-from etid.simulation.transformer import TransformerDriver
+from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from tests.conftest import REFERENCE_DATA
 
 RATE, SAMPLES, FULL_SCALE = 200e3, 10_000, 10.0
@@ -79,3 +80,88 @@ def test_drawn_drivers_pass_with_converters_of_all_bits():
             th, out = np.rint(codes * held["lsb"] / step) * step / held["scale"]
             one = Recording(th, out, sample_rate=float(held["fs"]), pulse_rate=float(held["f0"]))
             assert preflight(Inspected(one)) is None
+
+
+def test_a_value_with_few_samples_beside_the_rail_is_no_clipping():
+    """At the rail 5 samples in a row, next to it 1, then 3 at each value of the droop."""
+    top = np.repeat(np.arange(100.0, 60.0, -1.0), [5, 1, *[3] * 38])
+    quiet = np.resize([0.0, 1.0, -1.0, 1.0, 0.0, -1.0], 2000)
+    v = np.concatenate([np.concatenate([quiet, top]) for _ in range(3)])
+    for sign in (1.0, -1.0):
+        assert not is_clipped(sign * v, 1.0)
+    assert is_clipped(np.minimum(v, 80.0), 1.0)
+
+
+# --- Before the converter -------------------------------------------------------------------------
+
+
+def judged(v_th, v_out, **fields):
+    one = etid.Recording(v_th, v_out, sample_rate=RATE, pulse_rate=60.0, **fields)
+    return preflight(Inspected(one))
+
+
+@pytest.fixture(scope="module", params=["dry", "damp"])
+def good(request):
+    scene = getattr(etid.scenes, f"paper_{request.param}")(snr_db=60.0)
+    study = scene.simulate(seed=0)
+    return study[f"typical/{request.param}/04"]
+
+
+@pytest.mark.parametrize("adc_range", [None, (-186.9, 186.9)])
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])  # [V], behind the limiter
+@pytest.mark.parametrize("part", [0.4, 0.6, 0.8, 0.9])
+def test_an_amplifier_that_limits_within_the_range_is_seen(good, part, noise, adc_range):
+    """The verdict was `misfit`, `rate_mismatch` or `changed`."""
+    top = part * np.quantile(good.v_out, 0.99)
+    more = noise * np.random.default_rng(1).standard_normal(good.v_out.size)
+    v_out = np.minimum(good.v_out, top) + more
+    assert judged(good.v_th, v_out, adc_range=adc_range) == "saturated"
+    assert judged(-good.v_th, -v_out, adc_range=adc_range) == "saturated"
+    late = judged(good.v_th, np.roll(v_out, 7), adc_range=adc_range)
+    assert late == "saturated"
+
+
+def test_a_clipped_record_has_no_fit():
+    study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
+    driver = etid.identify_driver(study["calibration/98k8"], order=5)
+    one = study["typical/dry/04"]
+    for top in (20.0, 30.0, 40.0, 45.0):
+        fit = etid.identify_skin(one.replace(v_out=np.minimum(one.v_out, top)), driver, throw=False)
+        assert fit.verdict == "saturated"
+        assert np.isnan(fit.circuit.values()).all()
+
+
+HOLDING = {  # against the droop of V_th
+    "slow layer": etid.SkinLayers(2e4, 5e4, 0.3e-9, 5e4, 6e-9),
+    "capacitor in series": etid.circuit("R0-C1"),
+    "cole": etid.SkinCole(),
+    "diffusion": etid.SkinWarburg(),
+}
+
+
+@pytest.mark.parametrize("snr_db", [20.0, 25.0, 30.0, 35.0, 40.0, 60.0, 80.0])
+def test_no_good_record_stays_at_its_extreme_value(snr_db):
+    """A slow layer may hold V_out against the droop of V_th: its top has another shape."""
+    typed = type(HOLDING["capacitor in series"])(r_0=2e4, c_1=5e-9)
+    loads = [*LOADS.values(), *(ResistorLoad(r) for r in (21.6e3, 98.8e3, 555e3))]
+    loads += [lambda f, one=one: np.asarray(one.response(f)) for one in (*HOLDING.values(), typed)]
+    for number in range(3):
+        driver = drawn_driver(number, 0.1, TransformerDriver())
+        rng = np.random.default_rng(number)
+        outputs = [Output(driver), *(Output(driver, (load,)) for load in loads)]
+        volts = np.stack([one.volts(RATE, SAMPLES, rng) for one in outputs])
+        sigma = noise(driver, RATE, 0.0) * 10 ** (-snr_db / 20)
+        for bits in (8, 12, 16):
+            v_th, *rest = (converted(v, bits, sigma, i) for i, v in enumerate(volts))
+            for v_out in rest:
+                assert judged(v_th, v_out) != "saturated"
+
+
+def test_a_stimulator_that_holds_its_voltage_is_not_clipped():
+    t = np.arange(SAMPLES) / RATE * 60.0 % 1
+    held = np.where(t < 0.04, 10.0, 0.0)
+    current = 1e-3 * held / 10.0 * np.exp(-t / 0.02)
+    rng = np.random.default_rng(0)
+    v_out, i = (v + 1e-3 * np.ptp(v) * rng.standard_normal(SAMPLES) for v in (held, current))
+    one = etid.Recording(v_out=v_out, current=i, sample_rate=RATE, pulse_rate=60.0)
+    assert preflight(Inspected(one)) is None

@@ -332,7 +332,10 @@ def plan(
         estimator = for_calibrations(of_caller, [seen])
         if of_caller is None and estimator is MAXIMUM_LIKELIHOOD and seen.by_current is not None:
             name = preflight(seen.by_current, periodic=True)
-            estimator = WITH_CURRENT if name is not None or seen.has_all else estimator
+            if name == "flat":  # v_out is not; without a signal a current contradicts nothing
+                name = None
+            elif name is not None or seen.has_all:
+                estimator = WITH_CURRENT
     if name is None and isinstance(estimator, MaximumLikelihood) and estimator.with_current:
         if not seen.has_all:
             raise ValueError(

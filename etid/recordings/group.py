@@ -1,6 +1,7 @@
 """Recordings of equal length and equal rates, inspected together."""
 
 import functools
+import math
 from collections.abc import Hashable, Sequence
 from typing import TypeVar
 
@@ -19,7 +20,15 @@ from etid.signals.disturbances import (
 )
 from etid.signals.harmonics import filled, harmonics, whole_periods
 from etid.signals.mains import Hum, separated
-from etid.signals.noise import RIPPLE, VISIBLE, is_coarse, noise_std, shows_few, step_of
+from etid.signals.noise import (
+    RIPPLE,
+    VISIBLE,
+    is_coarse,
+    noise_std,
+    quietest,
+    shows_few,
+    step_of,
+)
 from etid.signals.pulse_train import PulseTrain, clocks_apart, lags_of, pulse_trains, rise_time
 from etid.signals.quick_looks import flickering, humming, uneven
 
@@ -79,7 +88,12 @@ class Group:
     @quietly()
     def noise(self) -> Float[np.ndarray, "recording 2"]:
         """Standard deviations of the noise of a sample of `whole` [V]."""
-        return np.asarray(noise_std(self.whole, self.step))
+        found = np.asarray(noise_std(self.whole, self.step))
+        for row, train in enumerate(self.trains):
+            for which, v in enumerate(self.whole[row]):
+                quiet = quietest(v, float(found[row, which]), self.sample_rate / train.counted)
+                found[row, which] = max(quiet, self.step[row, which] / math.sqrt(12.0))
+        return found
 
     @functools.cached_property
     @quietly()

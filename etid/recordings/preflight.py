@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from etid.recordings.group import BY_CHANCE, Group, covariance_of
 from etid.recordings.recording import Recording, quietly
 from etid.recordings.remarks import Remark
-from etid.signals.clipping import is_clipped, is_command
+from etid.signals.clipping import is_clipped, is_command, is_limited
 from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, aliases, joins_aliases
@@ -272,7 +272,7 @@ def _is_misaligned(inspected: Inspected) -> bool:
 
 
 def _is_saturated(inspected: Inspected) -> bool:
-    """Whether samples are at a limit of the converter, or at a rail if its range is unknown."""
+    """Whether samples are at a limit of the converter, or at a rail of unknown place."""
     # A current source holds its current, so a flat top of the current is no fault without noise.
     held = inspected.has_current and is_command(
         float(inspected.sigma[0]), float(inspected.step[0]), float(inspected.spans[0])
@@ -290,7 +290,19 @@ def _is_saturated(inspected: Inspected) -> bool:
                 return True
         elif lowest <= adc_range[0] + step / 2 or highest >= adc_range[1] - step / 2:
             return True
-    return False
+    return _is_limited(inspected)
+
+
+def _is_limited(inspected: Inspected) -> bool:
+    """Whether v_out stays at a level while v_th moves.
+
+    A measured current shows no such thing: a stimulator that holds its voltage is no fault.
+    """
+    if inspected.has_current or inspected.correlated is None:
+        return False
+    unit = float(max(inspected.sigma[1], inspected.step[1], inspected.coarse[1]))
+    aligned = shifted(*inspected.recorded, inspected.lag)
+    return unit > 0 and is_limited(*aligned, unit, inspected.recording.sample_rate)
 
 
 def _is_unconnected(inspected: Inspected) -> bool:

@@ -62,8 +62,9 @@ _TEXTS = {
         "bounds leave; its distribution is not symmetric, and fit.posterior() shows it."
     ),
     Remark.current_unused: (
-        "A current was recorded too, and this fit does not use it; identify_skin without a method "
-        "uses driver and current at once."
+        "A current was recorded too, and this fit does not use it: it carries no signal, or a "
+        "period was left out, or a method was given. identify_skin without a method uses driver "
+        "and current at once."
     ),
     Remark.follows_late: (
         "The residual looks like a resistance that follows its current late, as of skin whose "

@@ -5,6 +5,12 @@ white noise. The median of their magnitude gives its standard deviation (Donoho 
 the finest wavelet coefficients in the same way). The median ignores the few per cent of samples at
 the edges. The noise of a converter is at least resolution/√12.
 
+A multisine or a chirp has no quiet samples, and a tone at 0.18 of the sample rate passes these
+differences with a twentieth of its size. In a record whose differences do not change their sign as
+often as those of white noise, the spectrum shows the noise too: by the bins between the harmonics
+of the pulse rate, or at the top of the band in a single period. The smaller noise is taken
+(`quietest`).
+
 **Rounding.** Without noise, the rounding error of a converter is not white. Where the signal is
 slow, it is a saw-tooth that is the same in each period, so averaging over periods does not reduce
 it. Its size at each harmonic is found by rounding the waveform again. The waveform v is known to a
@@ -45,6 +51,9 @@ ORDER = 6
 DIFFERENCE = np.array([(-1.0) ** k * math.comb(ORDER, k) for k in range(ORDER + 1)])
 # Noise of a sample over the median size of a difference; a normal x has σ = 1.4826 · median |x|.
 PER_MEDIAN = 1.482602218505602 / math.sqrt(np.sum(DIFFERENCE**2))
+# Shares of sixth differences of white noise that have another sign than the first and the second
+# one after them: arccos(ρ)/π, with the correlations ρ of −6/7 and 15/28.
+CHANGES = np.arccos([-6 / 7, 15 / 28]) / np.pi
 RIPPLE = 1e-5  # error of the interpolation relative to the signal: a lower limit of the noise
 COARSE = 2.0  # step over noise; at this ratio 0.7 % of the saw-tooth is left
 VISIBLE = 1e-3  # of the signal; other errors hide the saw-tooth of a smaller step
@@ -118,6 +127,46 @@ def _middle(v: Float[np.ndarray, " time"]) -> float:
         between, place = sizes, half
     between.partition(place)
     return float(between[place])
+
+
+def quietest(v: Float[np.ndarray, " time"], sigma: float, spacing: float) -> float:
+    """Standard deviation of the noise, where a stationary signal has enlarged `sigma`.
+
+    Args:
+        v: Samples of the record.
+        sigma: Its `noise_std`.
+        spacing: Length of a pulse period [samples].
+
+    Returns:
+        The noise in the spectrum if it is surely smaller, else `sigma`.
+    """
+    signs = np.signbit(np.convolve(v, DIFFERENCE)[ORDER : v.size])
+    changes = [np.count_nonzero(signs[lag:] != signs[:-lag]) / v.size for lag in (1, 2)]
+    if np.abs(np.subtract(changes, CHANGES)).max() < 2.5 / math.sqrt(v.size):
+        return sigma
+    found = [sigma]
+    whole = np.arange(2, int((v.size + 0.5) / spacing) + 1)
+    if whole.size:
+        # The periods that end nearest to a sample: the rest would leak between the harmonics.
+        rest = np.abs(whole * spacing - np.rint(whole * spacing))
+        periods = int(whole[rest <= rest.min() + 1e-3][-1])
+        squares = np.abs(np.fft.rfft(v[: round(periods * spacing)])) ** 2
+        bins = np.arange(squares.size)
+        quiet = squares[(bins > squares.size / 2) & (bins % periods != 0)]
+        found.append(_surely(quiet / round(periods * spacing), sigma))
+    window = np.hanning(v.size)
+    squares = np.abs(np.fft.rfft(v * window)) ** 2 / np.sum(window**2)
+    found.append(_surely(squares[round(0.38 * v.size) :], sigma))
+    return min(found)
+
+
+def _surely(squares: Float[np.ndarray, " bin"], sigma: float) -> float:
+    """Noise of a sample from the powers of quiet bins, if it is surely below `sigma`, else that."""
+    if squares.size == 0:
+        return sigma
+    found = math.sqrt(float(np.median(squares)) / math.log(2))
+    # The median of n such powers has a relative error of 1.44/√n, its root of half of it.
+    return found if found < (1 - 8 * 0.72 / math.sqrt(squares.size)) * sigma else sigma
 
 
 def _every(samples: int) -> int:

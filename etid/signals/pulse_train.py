@@ -67,8 +67,11 @@ class PulseTrain:
         rate, pulse_rate = self.sample_rate, self.pulse_rate
         nominal = rate / pulse_rate
         said = f"sample_rate / pulse_rate is {nominal:.6g}"
+        rest = max(self.edges[0], self.size - self.edges[-1]) if self.edges.size else 0
         if self.spacing is not None:
-            if abs(self.spacing / nominal - 1) <= RATE:
+            # Two crests of a chirp or a pair of pulses, with room for a third, are no train.
+            is_pair = self.edges.size == 2 and rest > (1 + EVEN) * self.spacing
+            if abs(self.spacing / nominal - 1) <= RATE or is_pair:
                 return ""
             is_period = abs(pulse_rate * rate / self.spacing - 1) <= RATE
             slip = " pulse_rate is a period in seconds; give pulses per second." * is_period
@@ -79,7 +82,6 @@ class PulseTrain:
             )
         if self.edges.size != 1:
             return ""
-        rest = max(self.edges[0], self.size - self.edges[0])
         if rest <= (1 + EVEN) * nominal:
             return ""
         return (
