@@ -84,7 +84,6 @@ def test_the_current_is_left_out_on_request(recording, driver, both):
             lambda one: {"current": (1 + 0.01 * one.time / one.duration) * one.current},
             ("changed",),
         ),
-        (lambda one: {"current": 0 * one.current}, ("flat",)),
         (
             lambda one: {"current": np.where(np.arange(one.v_out.size) == 5, np.nan, one.current)},
             ("nonfinite_samples",),
@@ -96,6 +95,25 @@ def test_a_current_that_contradicts_the_driver_is_never_averaged(
 ):
     fit = etid.identify_skin(recording.replace(**change(recording)), driver, throw=False)
     assert fit.verdict in verdicts
+
+
+@pytest.mark.parametrize("level", [0.0, 2e-3])  # [A]
+@pytest.mark.parametrize("noise", [0.0, 1e-6])  # [A]
+def test_a_current_without_a_signal_is_left_out(recording, driver, level, noise):
+    """It refused a good recording as `flat`, or as `misaligned` where noise spans more."""
+    without = etid.identify_skin(recording.replace(current=None), driver)
+    rng = np.random.default_rng(0)
+    dead = [
+        recording.replace(current=level + noise * rng.standard_normal(recording.v_out.size))
+        for _ in range(5)
+    ]
+    fits = [etid.identify_skin(dead[0], driver), *etid.identify_skins(dead, driver)]
+    for fit in fits:
+        assert (fit.verdict, fit.method) == ("successful", "maximum_likelihood")
+        assert int(fit.remarks) & Remark.current_unused
+        # A batch differs by the order of sums: far less than a standard error.
+        np.testing.assert_allclose(fit.circuit.values(), without.circuit.values(), rtol=1e-6)
+    assert etid.identify_skin(dead[0], throw=False).verdict == "flat"
 
 
 def test_an_offset_and_a_common_delay_are_no_contradiction(recording, driver):

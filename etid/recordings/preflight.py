@@ -145,8 +145,12 @@ class Inspected:
 
     @property
     def is_flat(self) -> Bool[np.ndarray, "2"]:
-        """Whether `v_th` and `v_out` carry no signal: eight standard deviations span them."""
-        return (self.spans <= 8 * self.sigma) | (self.spans == 0)
+        """Whether `v_th` and `v_out` carry no signal: eight standard deviations span them.
+
+        Noise spans more in a long record, but its variance is then known better.
+        """
+        noise = np.diagonal(self.covariance) <= 1.2 * self.sigma**2
+        return (self.spans <= 8 * self.sigma) | noise | (self.spans == 0)
 
     @property
     def clocks_differ(self) -> bool:
