@@ -175,7 +175,7 @@ class AbstractCircuit(_Titled, Overviewed, Module):
 
     def titled(self: _Same, title: str) -> _Same:
         """The same circuit; print shows this title above its elements."""
-        same = type(self)(**{name: getattr(self, name) for name in self.names()})
+        same = self.of_fit([getattr(self, name) for name in self.names()])
         object.__setattr__(same, "_title", title)
         return same
 

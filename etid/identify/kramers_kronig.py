@@ -21,7 +21,6 @@ import scipy
 from jaxtyping import Complex, Float
 
 from etid.circuits.display import per_cent, rounded, several
-from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
 from etid.precision import in_float64
 from etid.signals.missing import unmasked
