@@ -1,7 +1,13 @@
 """Numbers, plurals and names as people read them."""
 
+import ast
+import itertools
+import pathlib
+import re
+
 import pytest
 
+import etid
 from etid.circuits.display import as_symbol, per_cent, quality, rounded, several, significant
 from etid.report.html import Section, Table
 
@@ -66,3 +72,79 @@ def test_a_section_is_printed_as_text_and_tables():
         "s01            9/10         33.4      1.2\n"
         "typical       10/10          186"
     )
+
+
+SOURCES = sorted(pathlib.Path(etid.__file__).parent.rglob("*.py"))
+THINGS = (
+    *("recording", "fit", "driver", "sample", "pulse", "electrode", "period", "file", "row"),
+    *("column", "draw", "value", "label", "calibration", "candidate", "impedance", "cell"),
+)
+# Counts that stand before a plural and cannot be one, because the text is said of more only.
+SEVERAL = {
+    "__init__.py: np.shape(one.rrse)",
+    "assemble.py: length",
+    "causes.py: rounded(abs(inspected.apart))",
+    "channel.py: len(alike)",
+    "channel.py: limits.SAMPLES",
+    "channel.py: self.length",
+    "contents.py: limits.SAMPLES",
+    "contents.py: record.stored.size",
+    "delimited.py: length",
+    "driver.py: rounded(open_delay)",
+    "fields.py: limits.SAMPLES",
+    "file.py: total",
+    "fit.py: kind",
+    "fits.py: len(rows)",
+    "hdf5_table.py: column.shape[0]",
+    "labels.py: len(others)",
+    "live.py: tick.number + 1",
+    "matlab.py: member.size",
+    "methods.py: len(fits)",
+    "pulse_train.py: rest",
+    "pulse_train.py: self.spacing",
+    "recording.py: size",
+    "state.py: DELAYS[-1]",
+    "spectra.py: width",
+    "study.py: len(fits)",
+    "study.py: len(found.drivers)",
+    "view.py: len(layout.electrodes)",
+}
+
+
+def texts(path):
+    """Texts of a module: all constants, without docstrings, and its f-strings."""
+    tree = ast.parse(path.read_text("utf-8"))
+    docs = {
+        id(node.value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    }
+    return [node for node in ast.walk(tree) if id(node) not in docs]
+
+
+def test_no_message_says_one_recordings():
+    plural = re.compile(rf"^ (?:{'|'.join(THINGS)})s\b")
+    found = set()
+    for path in SOURCES:
+        for node in texts(path):
+            parts = node.values if isinstance(node, ast.JoinedStr) else []
+            for count, text in itertools.pairwise(parts):
+                if not (isinstance(count, ast.FormattedValue) and isinstance(text, ast.Constant)):
+                    continue
+                if plural.match(str(text.value)):
+                    found.add(f"{path.name}: {ast.unparse(count.value)}")
+    assert found - SEVERAL == set()
+
+
+def test_no_message_gives_advice_that_only_python_understands():
+    """A command said method='output_error'."""
+    python = re.compile(r"\b(method|circuit|order)=['\"]")
+    found = [
+        f"{path.name}: {node.value}"
+        for path in SOURCES
+        for node in texts(path)
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and python.search(node.value)
+    ]
+    assert found == []

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import several
 from etid.precision import Module
 from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
@@ -163,7 +164,7 @@ class Harmonics(AbstractLane):
             ValueError: The arrays hold no whole period.
         """
         if periods[0] == 0:
-            raise ValueError(f"{m.v_out.shape[0]} samples hold no whole pulse period")
+            raise ValueError(f"no whole pulse period in {several(m.v_out.shape[0], 'sample')}")
         both = harmonics(jnp.stack([of[: periods[1]] for of in (m.v_th, m.v_out)]), *periods)
         sigma = jnp.stack([m.sigma_th, m.sigma_out])
         fields = map(jnp.asarray, filled(both, sigma, m.sample_rate, *periods))

@@ -332,8 +332,8 @@ def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dic
         every = tuple(range(count)) if rows is None else (rows,) if isinstance(rows, int) else rows
         if max(every) >= count:
             raise RecordingError(
-                f"row {max(every)} does not exist: channel {signals[name].channel!r} has {count} "
-                "rows, counted from 0",
+                f"row {max(every)} does not exist: channel {signals[name].channel!r} has "
+                f"{several(count, 'row')}, counted from 0",
                 field=f"{name}.rows",
             )
         rows_of[name] = list(every)
@@ -350,7 +350,7 @@ def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dic
             f"{name}: {channels[name].size} ({signals[name].channel!r})"
             if signals[name].rows is None
             else f"{name}: {several(len(rows), 'row')} of {signals[name].channel!r} with "
-            f"{channels[name].length} samples"
+            f"{several(channels[name].length, 'sample')}"
             for name, rows in rows_of.items()
         )
         raise RecordingError(

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from etid.circuits.display import rounded
+from etid.circuits.display import rounded, several
 from etid.files.channel import Channel, located
 from etid.files.mapping import Plan
 from etid.recordings.recording import RecordingError
@@ -70,8 +70,8 @@ def _clock(time: Channel, factor: float, length: int) -> float:
     """Sample rate [Hz] from the first and the last time stamp; the stamps must be uniform."""
     if time.shape != (length,) or length < 2:
         raise RecordingError(
-            f"has {time.size}, but v_out has {length} samples; each sample has one time, and there "
-            "are at least two",
+            f"has {time.size}, but v_out has {several(length, 'sample')}; each sample has one "
+            "time, and there are at least two",
             field="time",
         )
 

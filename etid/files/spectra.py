@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Complex, Float
 
+from etid.circuits.display import several
 from etid.files.channel import listed, located
 from etid.files.readers.delimited import Dialect, likely_dialect
 from etid.recordings import limits
@@ -152,7 +153,7 @@ def _names(lines: Sequence[str], dialect: Dialect) -> tuple[list[str], int]:
             raise _blanks(first, cells, width)
         if width == len(WITHOUT_NAMES):
             return [*WITHOUT_NAMES], first
-        raise RecordingError(f"has {width} columns without names", remedy=REMEDY)
+        raise RecordingError(f"has {several(width, 'column')} without names", remedy=REMEDY)
     header = dialect.header_line - 1
     for place in (header, header - 1):
         cells = dialect.cells(lines[place]) if place >= 0 else []
@@ -174,7 +175,8 @@ def _names(lines: Sequence[str], dialect: Dialect) -> tuple[list[str], int]:
 def _blanks(line: int, cells: Sequence[str], width: int) -> RecordingError:
     """The error for names with blanks, in a table with blanks between its cells."""
     return RecordingError(
-        f"line {line} names {len(cells)} columns, but there are {width} columns of numbers",
+        f"line {line} names {several(len(cells), 'column')}, but there are {width} columns of "
+        "numbers",
         remedy="Separate the cells by commas or semicolons in place of blanks",
     )
 

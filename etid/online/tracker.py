@@ -48,6 +48,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
@@ -266,8 +267,8 @@ class Tracker(Overviewed, Kept):
         found, own = state.electrodes.own.shape, len(self.model.circuit.names()) + 1
         if found != (self.electrodes, own):
             raise ValueError(
-                f"state has {found[0]} electrodes of {found[1] - 1} elements, the tracker "
-                f"{self.electrodes} of {own - 1}; it is the state of another tracker"
+                f"state has {several(found[0], 'electrode')} of {found[1] - 1} elements, the "
+                f"tracker {self.electrodes} of {own - 1}; it is the state of another tracker"
             )
 
     def pulses(
@@ -395,8 +396,8 @@ def for_each(name: str, given: Any, electrodes: int) -> Float[np.ndarray, " lane
     found = np.asarray(unmasked(given), float)
     if found.shape not in ((), (electrodes,)):
         raise ValueError(
-            f"{name} has shape {found.shape}; give one number, or one for each of {electrodes} "
-            "electrodes"
+            f"{name} has shape {found.shape}; give one number, or one for each of "
+            f"{several(electrodes, 'electrode')}"
         )
     if not (np.isfinite(found) & (found >= 0)).all():
         raise ValueError(f"{name} is {found}; it must be finite and not negative")

@@ -37,8 +37,8 @@ class Layout(Overviewed):
         x, y = (np.asarray(unmasked(of), float) for of in (self.x, self.y))
         if not x.shape == y.shape == (len(names),) or not np.isfinite([x, y]).all():
             raise RecordingError(
-                f"a layout needs a finite place for each electrode; {len(names)} electrodes have x "
-                f"of shape {x.shape} and y of shape {y.shape}"
+                f"a layout needs a finite place for each of {several(len(names), 'electrode')}; x "
+                f"is of shape {x.shape} and y of shape {y.shape}"
             )
         for name, value in (("electrodes", tuple(names)), ("x", x), ("y", y)):
             object.__setattr__(self, name, value)
