@@ -104,6 +104,8 @@ SEVERAL = {
     "pulse_train.py: self.spacing",
     "recording.py: size",
     "state.py: DELAYS[-1]",
+    "simulate.py: ELECTRODES",
+    "simulate.py: streamed['pulses']",
     "spectra.py: width",
     "study.py: len(fits)",
     "study.py: len(found.drivers)",

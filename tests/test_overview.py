@@ -163,7 +163,7 @@ def test_errors_and_derivatives_are_not_printed_as_a_circuit():
     assert str(errors).startswith("Standard errors of SkinRC\n")
     assert str(copy.deepcopy(errors)) == str(errors)
     assert str(jax.tree.map(np.asarray, DRY)).startswith("SkinRC: R_s")
-    derivative = DRY.with_values(np.array([2.0, 1.8, -1.6e14]))
+    derivative = jax.tree.unflatten(jax.tree.structure(DRY), [2.0, 1.8, -1.6e14])
     assert str(derivative).splitlines() == [
         "SkinRC: numbers by element in SI units, no circuit",
         "  r_s         2",

@@ -156,7 +156,7 @@ etid.identify_skin(of.skin, circuit='R0-R0') -> has R0 twice
 etid.identify_skins([of.skin], circuit='SkinRC')
     -> circuit: 'SkinRC' is a class of circuits; pass a circuit, as in etid.SkinRC\(\)
 etid.identify_impedance([1.0], [1j], circuit='auto')
-    -> circuit='auto' chooses for recordings, not for an impedance
+    -> the circuit 'auto' chooses for recordings, not for an impedance
 samples(of, circuit='R0-') -> 'R0\-' is no circuit
 etid.select_circuit(of.skin, candidates=['R0', 'R1']) -> holds R0 and R1, which have the
 [IdentificationError]

@@ -261,8 +261,8 @@ def identify_impedance(
     """
     if isinstance(circuit, str) and circuit == AUTO:
         raise ValueError(
-            "circuit='auto' chooses for recordings, not for an impedance; fit each candidate, and "
-            "compare verdict and chi2"
+            "the circuit 'auto' chooses for recordings, not for an impedance; fit each candidate, "
+            "and compare verdict and chi2"
         )
     f, z, sigma = checked_spectrum(frequency, impedance, stderr)
     structure, free = _held(circuit_of(circuit), known_elements(fixed, None))
