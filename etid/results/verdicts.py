@@ -98,8 +98,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "not filled anew. Check the acquisition."
     )
     saturated = (
-        "The converter clipped. Lower the gain or the stimulus and record again. If nothing "
-        "clipped, state the range of the converter (adc_range)."
+        "The converter or an amplifier before it clipped. Lower the gain or the stimulus and "
+        "record again. If nothing clipped, state the range of the converter (adc_range)."
     )
     nonfinite_samples = "A record contains NaN or infinite samples. Cut them out or record again."
     too_short = "The record is too short to identify anything. Record a whole pulse and its tail."
