@@ -103,7 +103,7 @@ def test_estimates_scatter_as_much_as_their_standard_errors_say(kind, rate, peri
         fit = etid.identify_skin(recorded(kind, periods, seed, rate)[0], throw=False)
         assert fit.verdict == "successful"
         stderr = [float(getattr(fit.stderr, name)) for name in fit.circuit.names()]
-        errors.append((fit.circuit.values() - TRUTH) / stderr)
+        errors.append((fit.circuit.values() - TRUTH) / np.array(stderr))
     scatter = np.sqrt(np.mean(np.square(errors), axis=0))
     assert (scatter > 0.7).all()
     assert (scatter < 1.4).all()

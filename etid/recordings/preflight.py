@@ -305,8 +305,9 @@ def _is_limited(inspected: Inspected) -> bool:
     if inspected.has_current or inspected.correlated is None:
         return False
     unit = float(max(inspected.sigma[1], inspected.step[1], inspected.coarse[1]))
-    aligned = shifted(*inspected.recorded, inspected.lag)
-    return unit > 0 and is_limited(*aligned, unit, inspected.recording.sample_rate)
+    v_th, v_out = inspected.recorded
+    v_th, v_out = shifted(v_th, v_out, inspected.lag)
+    return unit > 0 and is_limited(v_th, v_out, unit, inspected.recording.sample_rate)
 
 
 def _is_unconnected(inspected: Inspected) -> bool:

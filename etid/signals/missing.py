@@ -21,7 +21,8 @@ def unmasked(values: Any) -> npt.NDArray | jax.Array:
         values = np.ma.stack([np.ma.asarray(one) for one in values])
     if not np.ma.is_masked(values):
         return np.asarray(values)
-    found, hidden = np.ma.getdata(values), np.ma.getmaskarray(values)
+    found: np.ndarray = np.ma.getdata(values)
+    hidden: np.ndarray = np.ma.getmaskarray(values)  # pyright: ignore  # checked above
     if found.dtype.kind in "biu":  # integers have no NaN
         found = found.astype(float)
     return np.where(hidden, np.array(np.nan, found.dtype), found)
