@@ -79,13 +79,13 @@ def follow(
             return
         begin = time.perf_counter()
         if number <= last:
-            state = tracker.start(at_rest=at_rest)
+            state = tracker.start(at_rest=at_rest, after=state)
             if stimulator is not None:
                 stimulator.rest(RESTARTED)
         last = number
         if stimulator is not None and stimulator.resting:
             if stimulator.rested():
-                state = tracker.start(at_rest=True)
+                state = tracker.start(at_rest=True, after=state)
                 given = controller.command(state, charge=charge).amplitude
                 stimulator.send(given)
                 if view is not None and stimulator.reason:
