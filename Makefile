@@ -2,6 +2,7 @@
 #   make demo    simulate the paper's experiments, identify them, print the tables: demo/index.html
 #   make test    the ordinary tests
 #   make test-portable  the tests that compare with stored numbers, with the instructions of an old processor
+#   make outputs the texts that tests/outputs holds, anew: read what has changed
 #   make slow    the other tests: statistics, and what compiles long
 #   make ranking the benchmarks in short: which estimator is better, and is any wrong silently
 #   make notebooks  executes the notebooks: notebooks/executed/*.ipynb, with their figures
@@ -22,13 +23,19 @@ COMPILED := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.pytest_cache/d/xla JAX_PERSISTE
 # time of a collection.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-portable slow ranking notebooks docs wheel-test lint types clean
+.PHONY: demo test test-portable outputs slow ranking notebooks docs wheel-test lint types clean
 
 demo: .venv/package
 	$(BIN)/python -m etid.paper.demo demo/
 
 test: .venv/tools
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+# Each test writes its text, and fails because there was none.
+outputs: .venv/tools
+	rm -f tests/outputs/*.txt
+	-$(BIN)/python -m pytest --quiet --tb=no --numprocesses auto --dist loadfile tests/test_outputs_of_*.py
+	git diff --stat -- tests/outputs
 
 # Another order of sums must stay within the tolerances.
 test-portable: .venv/tools

@@ -7,7 +7,7 @@ import pytest
 
 import etid
 from etid.paper import demo, tables
-from tests import pictures
+from tests import pictures, printed
 
 EXCESS = 1.1  # of every identified element over the true one
 
@@ -51,3 +51,15 @@ def test_demo_tables_show_the_error_that_was_made(outcome):
     assert built[2:] == ("10.00 / 0.00",) * 3 + ("5.00", "12/23")
     verdicts = demo.table_verdicts([outcome], truth).rows[0]
     assert verdicts[2:] == ("successful", "72 successful, 71 misfit", *("100 %",) * 3)
+
+
+def test_the_tables_that_the_demo_prints(outcome):
+    shown = "\n\n".join(map(str, demo.sections([outcome], etid.scenes.paper().truth())))
+    printed.check("demo_tables", shown, fitted=False)
+
+
+@pytest.mark.slow
+def test_all_that_the_demo_prints(tmp_path, capsys):
+    demo.main([str(tmp_path)])
+    shown = printed.masked(capsys.readouterr().out, tmp_path)
+    printed.check("demo", shown, fitted=True)

@@ -278,9 +278,7 @@ class Fits(Overviewed, Generic[Circuit]):
             values, errors = (
                 np.array([group[name + part] for name in units]) for part in ("", "_stderr")
             )
-            elements = ["-"] * len(units)
-            if group["successful"]:
-                elements = [text for _, text, _ in element_rows(units, values, errors)]
+            elements = [text for _, text, _ in element_rows(units, values, errors)]
             rows.append((where, f"{group['successful']}/{group['fits']}", *elements))
         title = f"{several(len(self), 'fit')} of {type(self.circuit).__name__}"
         medians = "Median of the successful fits ± median standard error of one fit."

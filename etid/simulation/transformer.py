@@ -26,6 +26,8 @@ from fractions import Fraction
 import numpy as np
 from jaxtyping import Complex, Float
 
+from etid.circuits.display import quantity
+
 Impedance = Callable[[Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]]
 """A load: a function from frequencies [Hz] to impedance [ohm]."""
 
@@ -158,6 +160,9 @@ class ResistorLoad:
 
     r: float
 
+    def __str__(self) -> str:
+        return quantity(self.r, "ohm")
+
     def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
         """Impedance [ohm] at frequencies f [Hz]."""
         return np.full(f.shape, complex(self.r))
@@ -176,6 +181,10 @@ class SkinLoad:
     r_s: float
     r_p: float
     c_p: float
+
+    def __str__(self) -> str:
+        units = {"r_s": "ohm", "r_p": "ohm", "c_p": "farad"}
+        return ", ".join(f"{of} {quantity(getattr(self, of), unit)}" for of, unit in units.items())
 
     def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
         """Impedance [ohm] at frequencies f [Hz]."""
