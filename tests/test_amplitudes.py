@@ -168,7 +168,7 @@ def test_terms_and_their_slopes_agree_with_steps_in_time():
     source = SourceImpedance(r_th, none, none, none, none, omega, g)
     object.__setattr__(feed, "source", source)
     known = GivenDriver.measured(jnp.asarray(f))
-    loaded = source.response(jnp.asarray(f)) + 50e3
+    loaded = jnp.asarray(source.response(f)) + 50e3
     known = dataclasses.replace(known, loaded=loaded, resistance=jnp.array(50e3), by_current=False)
     of = Amplitudes(
         given=with_filter(known),

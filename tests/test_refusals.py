@@ -115,9 +115,9 @@ of.tracker.update(of.state, of.window, np.ones(3)) -> shape \(3,\)
 etid.Tracker.of(of.driver, of.calibration, electrodes=0) -> electrodes is 0
 etid.Tracker.of(of.driver, of.calibration, electrodes=1, change=-1.0) -> change is -1
 tracker(of, driver=pictures.as_kind(of.driver, ContinuousDriver)) -> harmonics
-of.tracker.update(of_others(of), of.window) -> 1 electrodes of 3 elements, the tracker 2 of 3
-of.tracker.read(of_others(of)) -> 1 electrodes of 3 elements, the tracker 2 of 3
-of.controller.command(of_others(of), charge=8e-08) -> 1 electrodes of 3 elements, the tracker 2 of 3
+of.tracker.update(of_others(of), of.window) -> 1 electrode of 3 elements, the tracker 2 of 3
+of.tracker.read(of_others(of)) -> 1 electrode of 3 elements, the tracker 2 of 3
+of.controller.command(of_others(of), charge=8e-08) -> 1 electrode of 3 elements, the tracker 2 of 3
 limited(of, current_cap=0.0) -> current_cap is 0
 limited(of, charge_cap=0.0) -> charge_cap is 0
 limited(of, voltage_cap=0.0) -> voltage_cap is 0

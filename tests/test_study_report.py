@@ -42,7 +42,7 @@ OWN, SHARED = 0.01, 0.02  # standard errors of all elements of the fits made her
 def fits_of(values, verdicts, **labels):
     """Fits by hand, of elements in units of `TRUE`, with errors `OWN` and `SHARED`."""
     count = len(verdicts)
-    circuit = etid.SkinRC(*(np.asarray(values) * np.array(list(TRUE.values()))[:, None]))
+    circuit = etid.SkinRC.of_fit(np.asarray(values) * np.array(list(TRUE.values()))[:, None])
     fit = pictures.fit(np.array(verdicts, object), circuit, OWN, SHARED)
     chi2 = np.where(np.asarray(verdicts) == "misfit", 7.0, 1.0) + 0.01 * np.arange(count)
     labels = {"path": np.array([f"loaded/{i}" for i in range(count)])} | labels
