@@ -155,7 +155,7 @@ def test_without_noise_its_bias_is_about_a_tenth_of_the_noise_of_100_pulses_at_6
     source = driver.source
     tracker = Tracker.of(driver, quiet()["cal/0"], electrodes=TEN)
     model = tracker.model
-    model = dataclasses.replace(model, source=source.response(model.bands.frequency))
+    model = dataclasses.replace(model, source=jnp.asarray(source.response(model.bands.frequency)))
     tracker = dataclasses.replace(tracker, model=model)
     sampler, v_th, *_ = scene(1)._exact()
     z_th = np.asarray(source.response(jnp.asarray(sampler.f)))

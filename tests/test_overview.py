@@ -124,7 +124,10 @@ SHOWN = {
     "stderr": (lambda: fit().stderr, ["SkinRC", "0.1 kΩ"]),
     "scene": (
         lambda: etid.scenes.paper_dry(),
-        ["1 calibration, 10 trials, 10000 samples", "typical/dry/10 r_s 33.4 kΩ, r_p 186 kΩ, c_p 0.12 nF"],
+        [
+            "1 calibration, 10 trials, 10000 samples",
+            "typical/dry/10 r_s 33.4 kΩ, r_p 186 kΩ",
+        ],
     ),
     "samples": (lambda: etid.Samples(np.zeros(4, "i2"), 0.5), ["Samples: 4 of int16"]),
     "spectrum": (

@@ -186,6 +186,15 @@ def test_a_stimulator_that_is_not_there_is_an_error_at_once():
         display(pytest.fail, send)
 
 
+@pytest.fixture
+def in_the_foreground():
+    """What a shell starts in the background ignores SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("in_the_foreground")
 def test_an_error_has_a_note_that_0_was_sent_and_signals_have_their_handlers_again():
     def handlers():
         return [signal.getsignal(of) for of in (signal.SIGINT, signal.SIGTERM, signal.SIGTSTP)]
@@ -207,6 +216,8 @@ RUNS = """
 import hashlib, os, signal, sys, time
 import numpy as np
 from etid.live.stimulator import Stimulator
+for of in (signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM, signal.SIGTSTP):
+    signal.signal(of, signal.SIG_DFL)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 how = sys.argv[1]
 with Stimulator(lambda of: os.write(1, b"%g\\n" % of[0]), 2, 2e-3 if how != "busy" else 5.0) as one:
