@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
 SAMPLES = 10_000
 SIGMAS = 5.0  # one in 2 million for a normal error
-FILES = 17  # that a reader of `identify_skin` opens at most; the last one tells the fit its data
+FILES = 18  # that a reader of `identify_skin` opens at most; one of them looks for limited records
 
 
 def simulate(trials=1, resistors=(98.8e3,), samples=SAMPLES, seed=0, **options):
