@@ -1,6 +1,7 @@
 """Closed loop: the charge at 98 electrodes under a fingertip that changes, and the cap on it.
 
-`benchmarks.control_hazards` counts the pulses above the cap. The rest is the charge against ngspice
+`benchmarks.control_hazards` counts the pulses above the cap, `benchmarks.control_loop` what is sent
+when the loop of a display meets a hazard. The rest is the charge against ngspice
 (`benchmarks.control_plant`): some electrodes stay dry, some become wet within 100 ms, some sweat,
 and one is lifted off and put back.
 
@@ -27,7 +28,7 @@ import scipy.special
 from jaxtyping import Array, Float
 
 import etid
-from benchmarks import control_hazards, ngspice
+from benchmarks import control_hazards, control_loop, ngspice
 from benchmarks.charts import INK, new_figure, save
 from benchmarks.control_plant import KINDS, OLDER, Display, Fingertip, by_ngspice, closed_loop
 from benchmarks.ladder import TWO
@@ -69,12 +70,13 @@ OPTIONS = (
     option("--snr", default=(60.0, 40.0), help="dB"),
     option("--hazard-electrodes", default=114),
     option("--hazard-pulses", default=4400),
+    option("--loop-draws", default=6, help="runs of each hazard of the loop"),
     option("-o", "--output", default=RESULTS / "control", help="of the .csv and the .svg"),
 )
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    asked = list(hazards(arguments))
+    asked = [*loop(arguments), *hazards(arguments)]
     fingertip = Fingertip(arguments.electrodes, arguments.pulses)
     runs: dict[str, Run] = {}
     for snr in arguments.snr:
@@ -91,6 +93,17 @@ def main(arguments: argparse.Namespace) -> bool:
         runs |= {f"{name}, {snr:g} dB": run for name, run in found.items()}
     draw(runs, fingertip, arguments.output.with_suffix(".svg"))
     return report(asked)
+
+
+def loop(arguments: argparse.Namespace) -> Sequence[Target]:
+    """Print and write what the loop that runs a display sends; the targets of all cells."""
+    met = control_hazards.Hazards(arguments.snr[0], 0)
+    rows = []
+    for row in control_loop.rows(met, arguments.loop_draws):
+        show(row)
+        rows.append(row)
+    write_csv(arguments.output.with_name(f"{arguments.output.stem}_loop.csv"), rows)
+    return list(control_loop.targets(rows))
 
 
 def hazards(arguments: argparse.Namespace) -> Iterator[Target]:

@@ -15,6 +15,7 @@ from benchmarks import __main__ as entry
 from benchmarks import (
     amplitude_errors,
     amplitudes,
+    control_loop,
     curves,
     online,
     online_alarms,
@@ -26,19 +27,24 @@ from benchmarks import (
     which,
 )  # fmt: skip
 from benchmarks.__main__ import NAMES, asked
+from benchmarks.control_hazards import Hazards
 from benchmarks.failure_draws import Effort
 from benchmarks.peers import START, ByNumPy, problem
 from benchmarks.rivals import RivalError
+from etid.live.output import Output
+from etid.live.stimulator import Stimulator
+from etid.online.stream import PAUSE
 
 # What is run of each benchmark, what it writes into the folder {}, and what its output must say.
 # So few draws scatter too much for most targets.
-HAZARDS = "--hazard-electrodes 19 --hazard-pulses 30"
+HAZARDS = "--hazard-electrodes 19 --hazard-pulses 30 --loop-draws 1"
 CASES = {
     "amplitude_errors": ("--draws 2", "", "scene 0: covered"),
     "amplitudes": ("", "", "error of harmonic balance"),
     "control": (
         f"--electrodes 4 --pulses 4 --snr 60 {HAZARDS} --output {{}}/control.csv",
-        "control.svg control.csv", "above the cap but the first after an unseen change  0",
+        "control.svg control.csv control_loop.csv",
+        "above the cap but the first after an unseen change  0",
     ),
     "coverage": ("--repetitions 3 --parts 0.03", "", "dry, default: covered"),
     "curves": ("--quick --folder {}", "curves.csv curves.svg", "LM fit, optimistix"),
@@ -158,6 +164,48 @@ def test_every_benchmark_has_options_and_a_case_or_a_test_of_its_own():
     assert {*NAMES} == CASES.keys() | OWN
     for name in NAMES:
         assert asked([name]).module.OPTIONS is not None
+
+
+def at_once(stimulator):
+    stimulator.resting = False
+    return True
+
+
+def only_at_rest(stimulator, output, usual=Stimulator._give_zero):
+    if output == Output.REST:
+        usual(stimulator, output)
+
+
+def as_before(tracker, *, at_rest=False, after=None, usual=etid.Tracker.start):
+    return usual(tracker, at_rest=at_rest) if after is None else after
+
+
+@pytest.mark.slow
+def test_hazards_of_the_loop_end_with_0_and_faults_of_the_loop_are_counted(monkeypatch):
+    """No limit of the time to the 0, which is longer beside other tests."""
+    hazards = Hazards(60.0, 0)
+    controller = hazards.controller(control_loop.LANES)
+    monkeypatch.setattr(Hazards, "controller", lambda *_: controller)
+    monkeypatch.setattr(control_loop, "LONGEST", 300)
+
+    def counted(cells, draws=1):
+        rows = list(control_loop.rows(hazards, draws, cells))
+        return np.array([[row[name] for name in control_loop.COLUMNS] for row in rows]).T
+
+    def with_fault(of, name, fault, cell, draws=1):
+        with monkeypatch.context() as faulty:
+            faulty.setattr(of, name, fault)
+            return counted([cell], draws)[:, 0]
+
+    numbers = counted(control_loop.CELLS)
+    assert not numbers[:3].any()
+    assert np.isfinite(numbers[3]).all()
+    assert with_fault(Stimulator, "rested", at_once, "backlog")[1] > 0
+    assert with_fault(Stimulator, "_give_zero", only_at_rest, "STOP")[0] == 1
+    never = with_fault(Stimulator, "_watch", lambda _: None, "silence")
+    assert never[3] > 2 * PAUSE * control_loop.PERIOD
+    # In one of these runs the skin becomes wet.
+    assert with_fault(etid.Tracker, "start", as_before, "counter from 0", draws=3)[2] > 0
 
 
 @pytest.mark.slow
