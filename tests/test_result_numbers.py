@@ -61,6 +61,15 @@ CLAIMS = {
         total("control", "above_after_unseen_change"),
         column("control", "largest_of_them_nC").max() / 1000,
     ],
+    ("docs/control.md", "In # runs of a simulated display"): lambda: [
+        total("control_loop", "runs")
+    ],
+    ("docs/control.md", "and none of # pulses exceeded the cap"): lambda: [
+        total("control_loop", "pulses")
+    ],
+    (README, "After a hazard of the loop 0 comes within # s"): lambda: [
+        column("control_loop", "longest_s").max()
+    ],
     (README, "Of # answers behind ten drivers, # are silent."): lambda: [
         total("perturbations", "answers"),
         total("perturbations", "silent"),
