@@ -162,8 +162,9 @@ def files(tmp_path_factory):
     _write_some(folder / "some.h5")
     _write_faults(folder / "faults.h5")
     i = 1e-3 * np.sin(2 * np.pi * 60 * np.arange(10_000) / 200e3)
-    rates = {"sample_rate": 200e3, "pulse_rate": 60.0}
-    milli = etid.Recording(v_out=5e4 * i, current=1e3 * i, path="milli", **rates)
+    milli = etid.Recording(
+        v_out=5e4 * i, current=1e3 * i, sample_rate=200e3, pulse_rate=60.0, path="milli"
+    )
     write([milli]).write(folder / "milli.h5")
     etid.fit_file(folder / "example.h5", folder / "fits.h5")
     with h5py.File(folder / "pulses.h5", "w") as stream:

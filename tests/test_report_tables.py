@@ -29,8 +29,9 @@ def fits():
 
 def size_of(heading):
     """The size in SI units of the unit of a heading, such as `median [kΩ]`."""
-    (prefix,) = re.search(r"\[(.?)[ΩF]\]", heading).groups()
-    return SIZES[prefix]
+    found = re.search(r"\[(.?)[ΩF]\]", heading)
+    assert found is not None, heading
+    return SIZES[found[1]]
 
 
 def test_a_share_is_of_all_recordings(fits):
