@@ -34,13 +34,15 @@ test: .venv/tools
 # Each test writes its text, and fails because there was none.
 outputs: .venv/tools
 	rm -f tests/outputs/*.txt
-	-$(BIN)/python -m pytest --quiet --tb=no --numprocesses auto --dist loadfile tests/test_outputs_of_*.py
+	-$(BIN)/python -m pytest --quiet --tb=no --numprocesses auto --dist loadfile -m "" \
+		tests/test_outputs_of_*.py tests/test_report.py
 	git diff --stat -- tests/outputs
 
 # Another order of sums must stay within the tolerances.
 test-portable: .venv/tools
 	XLA_FLAGS=--xla_cpu_max_isa=SSE4_2 OPENBLAS_CORETYPE=Nehalem $(BIN)/python -m pytest \
-		--numprocesses auto --dist loadfile -m "stored and not slow" $$(grep -l kept_numbers tests/test_*.py)
+		--numprocesses auto --dist loadfile -m "stored and not slow" \
+		$$(grep -lE "kept_numbers|import printed|, printed" tests/test_*.py)
 
 slow: .venv/tools
 	$(BIN)/python -m pytest -m slow --numprocesses auto --dist loadfile

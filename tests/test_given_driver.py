@@ -37,7 +37,7 @@ def information(driver):
     at = jnp.append(parameters, driver.calibration.delay_samples[0])
 
     def gain(p):
-        z = unflatten(p[:-1]).response(jnp.asarray(f))
+        z = jnp.asarray(unflatten(p[:-1]).response(f))
         return delayed(R_LOAD / (R_LOAD + z), jnp.asarray(f), p[-1], jnp.asarray(rate))
 
     slopes = np.asarray(jax.jacfwd(gain)(at)).T

@@ -91,6 +91,7 @@ def test_calibrations_and_studies_of_masked_arrays_have_missing_samples(study, r
         assert np.isfinite(made["loaded/0"].v_out).all()
 
 
+@pytest.mark.slow  # it compiles the whole fit
 def test_plain_arrays_with_a_mask_have_the_fit_of_nan(recording, driver):
     of = {"driver": driver, **RATES, "method": "maximum_likelihood"}
     hidden = np.ma.masked_array(recording.v_out, mask=np.arange(recording.v_out.size) == 500)

@@ -77,7 +77,6 @@ OUTPUTS = {
     ]),
     "fit_options": (True, [
         "fit one.h5 -o f.h5 --circuit auto",
-        "fit one.h5 -o f2.h5 --circuit SkinCole",
         "fit one.h5 -o f3.h5 --fix r_s=33.4e3 --bound r_p=100e3:180e3",
         "fit one.h5 -o f4.h5 --tolerance gain=1e-3 --tolerance r_load=1e-3",
         "fit one.h5 -o f5.h5 --method steiglitz_mcbride",
@@ -118,10 +117,10 @@ OUTPUTS = {
     ]),
     "live": (False, [
         "live one.h5 --file pulses.h5 --electrodes 2 --speed 50 --port 0",
-        "live one.h5 --file pulses.h5 --port 0",
-        "live one.h5 --file absent.h5 --port 0",
+        "live one.h5 --file pulses.h5 --electrodes 3 --port 0",
+        "live one.h5 --file absent.h5 --electrodes 2 --port 0",
         "live loaded.h5 --file pulses.h5 --port 0",
-        "live one.h5 --socket localhost --port 0",
+        "live one.h5 --socket localhost --electrodes 2 --port 0",
         "live one.h5 --port 0",
     ]),
     "no_command": (False, ["", "nonsense", "--help"]),

@@ -62,4 +62,5 @@ def test_the_tables_that_the_demo_prints(outcome):
 def test_all_that_the_demo_prints(tmp_path, capsys):
     demo.main([str(tmp_path)])
     shown = printed.masked(capsys.readouterr().out, tmp_path)
-    printed.check("demo", shown, fitted=True)
+    # Steiglitz-McBride does not converge in some of its fits.
+    printed.check("demo", shown, fitted=True, chaotic=True)
