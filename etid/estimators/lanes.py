@@ -149,7 +149,7 @@ class Harmonics(AbstractLane):
             elif flickers:
                 of = v, float(sigma), frequency, float(rate)
                 variances[number] = variances[number] * coloured(*of, *seen.periods)
-        if joins_aliases(*seen.periods):
+        if joins_aliases(*seen.periods) and not seen.has_no_aliases:
             of_both = zip((x, y), variances, strict=True)
             variances = [v + aliases(of, v, *seen.periods).variance for of, v in of_both]
         selected = selected & ~seen.covered(frequency)

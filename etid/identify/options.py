@@ -294,13 +294,18 @@ def for_calibrations(
 ) -> AbstractEstimator:
     """The requested estimator, or the default estimator of calibrations.
 
-    The default is maximum likelihood if all records hold several periods. Otherwise it is output
-    error: in a single period the aliases are not in the standard errors of maximum likelihood.
+    The default is maximum likelihood if all records hold several periods, or one without aliases.
+    Otherwise it is output error: in a single period the aliases are not in the standard errors of
+    maximum likelihood. Output error weighs all frequencies alike; of a single period of a 1/f
+    multisine, it does not find the elements.
     """
     if asked is not None:
         return asked
-    several = all(seen.periods[0] > 1 and seen.is_periodic for seen in recordings)
-    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
+    on_harmonics = all(
+        seen.periods[0] > 0 and seen.is_periodic and (seen.periods[0] > 1 or seen.has_no_aliases)
+        for seen in recordings
+    )
+    return MAXIMUM_LIKELIHOOD if on_harmonics else OUTPUT_ERROR
 
 
 def check_default(estimator: AbstractEstimator, circuits: Sequence[AbstractCircuit]) -> None:

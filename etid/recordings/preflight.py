@@ -15,7 +15,7 @@ from etid.recordings.remarks import Remark
 from etid.signals.clipping import is_clipped, is_command, is_limited
 from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
-from etid.signals.harmonics import ALIASED, aliases, joins_aliases
+from etid.signals.harmonics import ALIASED, aliases, have_ended, joins_aliases
 from etid.signals.mains import Hum
 from etid.signals.pulse_train import PulseTrain, largest_drift, rise_time, shifted, whole_lag
 
@@ -219,10 +219,16 @@ class Inspected:
     @property
     def is_aliased(self) -> bool:
         """Whether aliases of unknown size fall on the harmonics of `v_th`, above its noise."""
-        if not joins_aliases(*self.periods):
+        if not joins_aliases(*self.periods) or self.has_no_aliases:
             return False
         _, x, _, variance, *_ = self.spectrum
         return aliases(x, variance, *self.periods).are_unknown(variance)
+
+    @property
+    def has_no_aliases(self) -> bool:
+        """Whether the spectra of a current and of `v_out` surely end below half the sample rate."""
+        _, x, y, variance_x, variance_y, _ = self.spectrum
+        return self.has_current and have_ended((x, y), (variance_x, variance_y), *self.periods)
 
     @property
     def is_periodic(self) -> bool:

@@ -30,7 +30,8 @@ class PulseTrain:
 
     Attributes:
         edges: Starts of the pulses, or their ends if there are more ends [samples].
-        spacing: Spacing of the pulses [samples]; None for a single pulse or uneven spacing.
+        spacing: Spacing of the pulses [samples]; None for a single pulse, uneven spacing, or
+            pulses of different shapes, such as the crests of a multisine.
         size: Length of the record [samples].
         sample_rate: Samples per second [Hz], as the recording says.
         pulse_rate: Pulses per second [Hz], as the recording says.
@@ -142,8 +143,22 @@ def pulse_trains(
         spacings = _spacings(records, several, edges, step, sample_rate) if even else None
         for number, row in enumerate(several):
             spacing = None if spacings is None else float(spacings[number])
+            if spacing is not None and not _are_alike(coarse[same[number]], edges, step):
+                spacing = None
             trains[row] = PulseTrain(edges, spacing, size, sample_rate, pulse_rate)
     return trains
+
+
+def _are_alike(
+    coarse: Float[np.ndarray, " place"], edges: Int[np.ndarray, " pulse"], step: int
+) -> bool:
+    """Whether the record continues after the last pulse as after the first one, and before them.
+
+    Of records that are not alike, the difference has twice the mean power of both, or more.
+    """
+    late = (int(edges[-1]) - int(edges[0])) // step
+    first, last = coarse[:-late], coarse[late:]
+    return bool(np.var(last - first) < 0.5 * (np.var(first) + np.var(last)))
 
 
 def _step(period: float) -> int:
