@@ -219,7 +219,7 @@ def filled(
 # All are relative to the sample rate.
 LOWER, UPPER = (0.33, 0.38), (0.40, 0.45)  # bands that show how the spectrum falls
 COHERENT = 0.05  # width over which aliases have nearly the same relative error
-BEFORE, BEYOND = (0.1, 0.2), (0.25, 0.5)  # bands that show whether a spectrum has ended
+OCTAVES, BEYOND = (0.1, 0.05, 0.025, 0.0125), (0.25, 0.5)  # bands that show whether one has ended
 END = 5.0  # the power of edges falls with p = 2, behind a filter of 60 kHz at 200 kHz with 3.8
 
 
@@ -291,17 +291,22 @@ def have_ended(
 ) -> bool:
     """Whether both records surely end below half the sample rate, so that they have no aliases.
 
-    The spectrum of the cause falls so far that what noise may hide beyond, three standard errors,
-    is less than edges would have there. Noise that hides a spectrum proves no end. Nothing but
-    noise is beyond in the other record: a record that does not close leaks into all harmonics. The
-    estimate of the noise has two standard errors of these, so that eight of them are allowed.
+    From one of the octaves, the spectrum of the cause falls so far that what noise may hide beyond,
+    three standard errors, is less than edges would have there. Noise that hides a spectrum proves
+    no end. Nothing but noise is beyond in the other record: a record that does not close leaks into
+    all harmonics. The estimate of the noise has two standard errors of these, so that eight of them
+    are allowed.
     """
     position = np.arange(1.0, variances[0].size + 1) * (periods / samples)
-    before, beyond = ((position >= low) & (position < high) for low, high in (BEFORE, BEYOND))
-    if not (before.any() and beyond.any()):
+    beyond = (position >= BEYOND[0]) & (position < BEYOND[1])
+    if not beyond.any():
         return False
     excess = [np.square(np.abs(c)) - v for c, v in zip(coefficients, variances, strict=True)]
     errors = [v[beyond].mean() / math.sqrt(np.count_nonzero(beyond)) for v in variances]
     of_cause = max(excess[0][beyond].mean(), 0.0) + 3 * errors[0]
-    falls = excess[0][before].mean() > of_cause * (sum(BEYOND) / sum(BEFORE)) ** END
+    falls = False
+    for low in OCTAVES:
+        inside = (position >= low) & (position < 2 * low)
+        level = of_cause * (sum(BEYOND) / (3 * low)) ** END
+        falls |= inside.any() and excess[0][inside].mean() > level
     return bool(falls and excess[1][beyond].mean() < 8 * errors[1])
