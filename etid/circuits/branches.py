@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.impedance import AbstractConnection, AbstractImpedance
+from etid.numpy_tier.tiers import program
 
 # Places of the elements of a branch. In two branches that can be exchanged, those with the same
 # number correspond.
@@ -138,8 +139,14 @@ def _connections(kind: type[AbstractCircuit], logs: np.ndarray) -> Iterator[list
     yield from walk(*(_parts(tree) or [tree] for tree in trees))
 
 
-def _tree(kind: type[AbstractCircuit], logs: np.ndarray) -> AbstractImpedance:
-    return kind().with_values(np.exp(logs)).impedance()
+@program
+def _tree(kind: type[AbstractCircuit], logs: Any) -> AbstractImpedance:
+    return kind().with_values(jnp.exp(logs)).impedance()
+
+
+@program
+def _response(kind: type[AbstractCircuit], logs: Any, s: Any) -> Any:
+    return kind().with_values(jnp.exp(logs)).impedance()(s)
 
 
 def _parts(of: AbstractImpedance) -> list[AbstractImpedance]:
@@ -182,7 +189,7 @@ def _is_same(
     s, random = 2j * np.pi * np.geomspace(1.0, 1e7, 15), np.random.default_rng(0)
     for _ in range(2):
         drawn = logs + 0.3 * random.standard_normal(logs.size)
-        z, changed = (np.asarray(_tree(kind, of)(jnp.asarray(s))) for of in (drawn, change(drawn)))
+        z, changed = (np.asarray(_response(kind, of, s)) for of in (drawn, change(drawn)))
         if not np.allclose(z, changed, rtol=EQUAL, atol=0.0):
             return False
     return True

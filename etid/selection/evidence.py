@@ -95,7 +95,7 @@ def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) 
 
     def is_beaten(number: int) -> bool:
         least = min(criterion[other] + _ahead(number, other, size) for other in fits)
-        return least < criterion[number]
+        return bool(least < criterion[number])
 
     left = [number for number in fits if not is_beaten(number)]
     good = [number for number in left if ranks[number] == min(ranks[one] for one in left)]
