@@ -72,7 +72,6 @@ def spiked(one, size):
     ("change", "verdict"),
     [
         (lambda one: 1.003 * one.current, "inconsistent"),
-        (lambda one: 0 * one.current, "flat"),
         (lambda one: -one.current, "misaligned"),
         (lambda one: spiked(one, 3.0), "rate_mismatch"),  # it looks like a pulse
     ],
@@ -81,6 +80,14 @@ def test_a_current_that_contradicts_the_driver_is_told(pair, joint, change, verd
     calibration, recording = pair
     found = jointly([calibration, recording.replace(current=change(recording))])
     assert found.fits.verdicts.tolist() == [verdict]
+
+
+def test_a_current_without_a_signal_is_left_out(pair):
+    calibration, recording = pair
+    fit = jointly([calibration, recording.replace(current=0 * recording.current)]).fits[0]
+    assert fit.verdict == "successful"
+    assert int(fit.remarks) == Remark.current_unused
+    assert np.abs(off(fit)).max() < WITHIN
 
 
 @pytest.mark.parametrize(("name", "late"), [("current", LATE[1]), ("v_out", LATE[2])])
