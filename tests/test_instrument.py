@@ -390,17 +390,19 @@ def tracked(calibration, skin, instrument):
 
 @pytest.mark.parametrize("kind", ["dry", pytest.param("damp", marks=pytest.mark.slow)])
 def test_a_tracker_has_the_errors_of_the_instrument(kind):
-    _, before, without = tracked(*exact(kind), etid.Instrument())
+    *_, without = tracked(*exact(kind), etid.Instrument())
     for source, size in ERRORS.items():
         error: dict[str, Any] = {source: size}
-        *_, stated = tracked(*exact(kind), etid.Instrument(**error))
+        _, before, stated = tracked(*exact(kind), etid.Instrument(**error))
         fit, after, _ = tracked(*records(SKINS[kind], **error), etid.Instrument(**error))
         assert fit.verdict == "successful"
         added, moved = np.sqrt(stated - without), np.abs(after - before)
         if source == "capacitance":  # more current flows, but not through the skin
             added, moved = added[:-1], moved[:-1]
         # What a tolerance adds is what an error of its size does, as in the budget of a fit.
-        np.testing.assert_allclose(added, moved, rtol=0.1, atol=0.05 * moved.max(), err_msg=source)
+        # With another calibration, not all of its noise is the same: then within a standard error.
+        noise = np.sqrt(without).max() if source == "c_load" else 0.05 * moved.max()
+        np.testing.assert_allclose(added, moved, rtol=0.1, atol=noise, err_msg=source)
 
 
 def test_a_stated_delay_is_no_help_to_a_tracker_whose_windows_begin_between_two_samples():
