@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import signal
 
 import jax
 import pytest
@@ -95,6 +96,14 @@ def run_as_for_users(_who_runs_programs):
 def _room_for_executables():
     yield
     make_room()
+
+
+@pytest.fixture
+def in_the_foreground():
+    """What a shell starts in the background ignores SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

@@ -509,14 +509,6 @@ ENDS = {
 }
 
 
-@pytest.fixture
-def in_the_foreground():
-    """What a shell starts in the background ignores SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("in_the_foreground")
 @pytest.mark.parametrize("how", ENDS)
 def test_the_command_leaves_0_behind_and_says_so(calibration, how, capsys):

@@ -186,14 +186,6 @@ def test_a_stimulator_that_is_not_there_is_an_error_at_once():
         display(pytest.fail, send)
 
 
-@pytest.fixture
-def in_the_foreground():
-    """What a shell starts in the background ignores SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("in_the_foreground")
 def test_an_error_has_a_note_that_0_was_sent_and_signals_have_their_handlers_again():
     def handlers():
