@@ -2,8 +2,9 @@
 
 At every harmonic the records are an input X and outputs G_m e^(−jωτ_m) X: V_out of the trial with
 G = Z_L / (Z_L + Z_th), the current with 1 / (Z_L + Z_th) if it is recorded, and V_out of each
-calibration. All records have white noise. The rounding error of a coarse converter is noise that is
-not white (`etid.signals.noise`): where the signal is slow, it is the same in each period. X and
+calibration. All records have the noise of the scene, which is white or has passed its filter. The
+rounding error of a coarse converter is not white (`etid.signals.noise`): where the signal is slow,
+it is the same in each period. X and
 Z_th are unknown complex numbers at every harmonic, so the bound holds for every kind of driver.
 Without a calibration V_th tells nothing about the load, and the bound is that of the input I and
 the output Z_L e^(−jωτ) I. The information about the gains is (Pintelon and Schoukens, System
@@ -133,7 +134,7 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> B
         raise ValueError("the scene has neither noise nor a converter; every bound is zero")
     inside = waveform.f < scene.sample_rate / 2
     f, z_th = waveform.f[inside], waveform.z_th[inside]
-    x = waveform.v_th[inside] * math.sqrt(scene.samples) / waveform.sigma
+    x = waveform.v_th[inside] * math.sqrt(scene.samples) / waveform.noise[inside]
     known = [] if known_driver else [_circuit(trial) for trial in scene.calibration]
     found: dict[tuple, Float[np.ndarray, "n n"]] = {}  # trials with the same load share a bound
     bounds = Bounds()
@@ -141,8 +142,8 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> B
         circuit = _circuit(trial)
         key = (type(circuit), *np.asarray(circuit.values()))
         if key not in found:
-            noise = _noise(scene, trial, f.size, waveform.sigma)
-            current = _current_noise(scene, circuit, waveform) if measured else None
+            noise = _noise(scene, trial, waveform, f.size)
+            current = _current_noise(scene, circuit, waveform)[inside] if measured else None
             signals = _Signals(f, x, z_th, noise, current)
             found[key] = _covariance(
                 circuit, known, signals, delays, known_driver, scene.shared_v_th
@@ -165,40 +166,43 @@ def _circuit(trial: Trial) -> AbstractCircuit:
 
 
 def _noise(
-    scene: Scene, trial: Trial, harmonics: int, white: float
+    scene: Scene, trial: Trial, waveform: Waveform, harmonics: int
 ) -> Float[np.ndarray, "row harmonic"]:
     """Standard deviations of the coefficients of a trial and its calibrations.
 
     Args:
         scene: The scene.
         trial: One of its trials.
-        harmonics: Number of harmonics.
-        white: Standard deviation of a sample with white noise [V].
+        waveform: Its harmonics and their noise.
+        harmonics: Number of harmonics that count.
 
     Returns:
-        Standard deviations relative to those with white noise: of V_out and then of V_th of the
+        Standard deviations relative to those of `waveform.noise`: of V_out and then of V_th of the
         trial and of each calibration.
     """
     records = 1 + len(scene.calibration)
     relative = np.ones((2 * records, harmonics))
     step = 0.0 if scene.bits is None else scene.full_scale / 2 ** (scene.bits - 1) / scene.scale
     periods = whole_periods(scene.samples, scene.sample_rate, scene.pulse_rate)
-    if white**2 - step**2 / 12 >= (step / COARSE) ** 2 or periods[0] == 0:
+    if waveform.sigma**2 - step**2 / 12 >= (step / COARSE) ** 2 or periods[0] == 0:
         return relative
     study = dataclasses.replace(scene, trials=(trial,)).simulate(0)
     recordings = [study[one.path] for one in (trial, *scene.calibration)]
     voltages = [one.v_out for one in recordings] + [one.v_th for one in recordings]
     for row, v in zip(relative, voltages, strict=True):
         if is_coarse(v, step):
-            found = np.sqrt(rounding_variance(v, step, *periods) * periods[1]) / white
-            row[: found.size] = found[:harmonics]
+            found = np.sqrt(rounding_variance(v, step, *periods) * periods[1])[:harmonics]
+            row[: found.size] = found / waveform.noise[: found.size]
     return relative
 
 
-def _current_noise(scene: Scene, circuit: AbstractCircuit, waveform: Waveform) -> float:
-    """Standard deviation of the recorded current [A] relative to that of a voltage [V]."""
+def _current_noise(
+    scene: Scene, circuit: AbstractCircuit, waveform: Waveform
+) -> Float[np.ndarray, " f"]:
+    """Standard deviations of the recorded current [A] relative to those of a voltage [V]."""
     load = np.asarray(circuit.response(jnp.asarray(waveform.f)))
-    return scene.current_noise(waveform.v_th / (load + waveform.z_th)) / waveform.sigma
+    sigma = scene.current_noise(waveform.v_th / (load + waveform.z_th))
+    return sigma * scene.colour(waveform.f) / waveform.noise
 
 
 class _Signals(NamedTuple):
@@ -206,7 +210,7 @@ class _Signals(NamedTuple):
 
     Attributes:
         f: Harmonics [Hz].
-        x: V_th at these, in standard deviations of a coefficient with white noise.
+        x: V_th at these, in standard deviations of a coefficient with the noise of the scene.
         z_th: Source impedance [Ω].
         noise: From `_noise`.
         current: From `_current_noise`; None if the current is not recorded.
@@ -216,7 +220,7 @@ class _Signals(NamedTuple):
     x: Complex[np.ndarray, " f"]
     z_th: Complex[np.ndarray, " f"]
     noise: Float[np.ndarray, "row f"]
-    current: float | None
+    current: Float[np.ndarray, " f"] | None
 
 
 def _covariance(
@@ -239,7 +243,7 @@ def _covariance(
         loop = 1 / (z[0] + z_th)
         outputs = [(z[0] * loop, z_th * loop**2, of_v_out[0])]
         if current is not None:
-            outputs.append((loop, -(loop**2), np.full(f.size, current)))
+            outputs.append((loop, -(loop**2), current))
         gains, by_load, of_y = (np.stack(of) for of in zip(*outputs, strict=True))
         record = np.append(np.zeros(len(outputs), int), np.arange(1, len(loads)))
         total = np.stack([*[z[0]] * len(outputs), *z[1:]]) + z_th
@@ -248,7 +252,8 @@ def _covariance(
         record, of_x = (0 * record, of_v_th[:1]) if shared_v_th else (record, of_v_th)
     else:
         x, gains, by_load, by_z_th = x / (z[0] + z_th), np.stack(z[:1]), np.ones((1, f.size)), None
-        of_y, record, of_x = of_v_out[:1], np.zeros(1), np.full((1, f.size), current)
+        assert current is not None  # there is a calibration, or the current is recorded
+        of_y, record, of_x = of_v_out[:1], np.zeros(1), current[None]
     count, elements = gains.shape[0], slope.shape[1]
     a = np.zeros((count, elements + count, f.size), complex)
     a[: len(by_load), :elements] = by_load[:, None] * np.asarray(slope).T

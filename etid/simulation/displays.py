@@ -5,7 +5,6 @@ the fourth to sixth row become wet, after two thirds the last electrode loses co
 """
 
 import dataclasses
-import math
 import os
 
 import numpy as np
@@ -13,6 +12,7 @@ from jaxtyping import Float
 
 from etid.precision import in_float64
 from etid.recordings.replacing import replacing_hdf5
+from etid.simulation.electronics import Electronics
 from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import OpenLoad, SkinLoad
@@ -30,7 +30,7 @@ def write_stream(scene: Scene, path: str | os.PathLike[str], seed: int) -> int:
 
     Args:
         scene: Its skins are those of the electrodes, in turn, with a spread between electrodes. Its
-            noise and converter are those of the stream.
+            noise, filter and converter are those of the stream.
         path: HDF5 file to write; an existing file is replaced.
         seed: Seed of the skins, of the noise, and of the delay of each electrode.
 
@@ -55,13 +55,12 @@ def write_stream(scene: Scene, path: str | os.PathLike[str], seed: int) -> int:
     periods[-1][-1] = _voltages(scene, (open_load,), seed)[0]
 
     step = scene.full_scale / 2 ** (scene.bits - 1) / scene.scale if scene.bits else 0.0
-    sigma = math.sqrt(max(scene.waveform().sigma ** 2 - step**2 / 12, 0.0))
     samples = periods[0].shape[1]
     with replacing_hdf5(path) as file:
         shape = (ELECTRODES, PARTS * REPEATS * samples)
         v_out = file.create_dataset("v_out", shape, "f4", chunks=(ELECTRODES, 500))
         for at in range(PARTS * REPEATS):
-            v = periods[at // REPEATS] + sigma * rng.standard_normal(periods[0].shape)
+            v = periods[at // REPEATS] + scene.noise(rng, periods[0].shape)
             v_out[:, at * samples : (at + 1) * samples] = step * np.rint(v / step) if step else v
     return round(PARTS * REPEATS * samples * scene.pulse_rate / scene.sample_rate)
 
@@ -76,9 +75,17 @@ def _periods(
 def _voltages(
     scene: Scene, trials: tuple[Trial, ...], seed: int
 ) -> Float[np.ndarray, "electrode time"]:
-    """Loaded voltages without noise [V]."""
+    """Loaded voltages without noise and hum [V]."""
+    of = scene.electronics
+    filtering = None if of is None else Electronics(of.filter_type, of.filter_order)
     quiet = dataclasses.replace(
-        scene, trials=trials, calibration=(), snr_db=None, bits=None, shared_v_th=True
+        scene,
+        trials=trials,
+        calibration=(),
+        snr_db=None,
+        bits=None,
+        shared_v_th=True,
+        electronics=filtering,
     )
     study = quiet.simulate(seed)
     return np.stack([study[trial.path].v_out for trial in trials])

@@ -14,6 +14,11 @@ record. The chain from circuit to file is
     exact periodic waveform → anti-alias filter → sampling at start + delay + n / sample_rate
     → · scale → + offset + white noise → rounding to a code, clipped at the full scale.
 
+With `Electronics` the noise comes before the filter, and an instrument has hum, a drifting gain, a
+nonlinearity and noise of its own; `INSTRUMENTS` has some that exist:
+
+    study = etid.scenes.paper_dry(**etid.scenes.INSTRUMENTS["delta_sigma_card"]).simulate(seed=0)
+
 A scene may also record the current through the load of each trial, with a delay and white noise of
 its own.
 """
@@ -36,6 +41,8 @@ from etid.precision import in_float64
 from etid.recordings.fields import LABELS, tidy_path
 from etid.recordings.recording import Recording, Samples
 from etid.recordings.study import Study
+from etid.simulation.electronics import INSTRUMENTS as INSTRUMENTS
+from etid.simulation.electronics import Electronics as Electronics
 from etid.simulation.published import BUILT, FINGERTIPS, REFERENCE, TABLE_1, TYPICAL
 from etid.simulation.transformer import (
     Impedance,
@@ -89,12 +96,16 @@ class Waveform:
         f: Harmonics of the pulse rate [Hz], far beyond half the sample rate.
         v_th: Fourier coefficients of the unloaded voltage after the anti-alias filter [V].
         z_th: Source impedance [ohm].
-        sigma: Standard deviation of a sample, from noise and rounding together [V].
+        noise: Noise and rounding together, as the standard deviation of samples of white noise with
+            their power at a harmonic [V].
+        sigma: Standard deviation of a sample, from noise and rounding together, 1/f noise aside
+            [V].
     """
 
     f: Float[np.ndarray, " f"]
     v_th: Complex[np.ndarray, " f"]
     z_th: Complex[np.ndarray, " f"]
+    noise: Float[np.ndarray, " f"]
     sigma: float
 
 
@@ -112,9 +123,10 @@ class Scene(Overviewed):
             converter's clock [1e-6]. The files do not contain it.
         samples: Length of a record [samples]; 10 000 are three periods.
         start: Time of the first sample after the start of a period [s].
-        antialias: Corner of the 4th-order Butterworth anti-alias filter, relative to `sample_rate`.
+        antialias: Corner of the anti-alias filter, relative to `sample_rate`. It is a Butterworth
+            filter of 4th order if `electronics` does not say otherwise.
         snr_db: Effective value of the unloaded voltage over one period, after the anti-alias
-            filter, relative to that of the white noise of every record [dB]; None for no noise.
+            filter, relative to that of the noise of every record there [dB]; None for no noise.
         current_snr_db: The same ratio for the current through each trial, which is then recorded;
             None if it is not. The current is not rounded.
         trigger_jitter_rms: Standard deviation of the delay, drawn for each record [s]. A positive
@@ -124,6 +136,8 @@ class Scene(Overviewed):
         full_scale: The converter clips at ± this voltage [V at the converter].
         bits: Resolution of the converter [bit]; None stores unrounded volts at the converter.
         scale: Volts at the converter per volt at the terminal.
+        electronics: The amplifier, whose noise passes the filter, and the errors of filter and
+            converter. If None, the noise is white, as behind the filter.
     """
 
     trials: tuple[Trial, ...] = ()
@@ -143,13 +157,15 @@ class Scene(Overviewed):
     full_scale: float = 10.0
     bits: int | None = 16
     scale: float = 0.0535
+    electronics: Electronics | None = None
 
     def _overview(self) -> Overview:
         labels = ("subject", "session", "site", "condition", "electrode", "trial")
         every = self.calibration + self.trials
         known = [name for name in labels if any(getattr(one, name) for one in every)]
         rows = [(one.path, str(one.load), *(getattr(one, name) for name in known)) for one in every]
-        noise = "no noise" if self.snr_db is None else f"noise at {self.snr_db:g} dB"
+        where = "" if self.electronics is None else " before the filter"
+        noise = "no noise" if self.snr_db is None else f"noise at {self.snr_db:g} dB{where}"
         title = (
             f"Scene: {several(len(self.calibration), 'calibration')}, "
             f"{several(len(self.trials), 'trial')}, {several(self.samples, 'sample')} at "
@@ -276,8 +292,45 @@ class Scene(Overviewed):
         """Noise-free harmonics of the records, and the noise of a sample."""
         sampler, v_th, z_th, sigma = self._exact()
         step = self._converter()[0] if self.bits is not None else 0.0
-        total = math.hypot(sigma, step / math.sqrt(12)) / self.scale
-        return Waveform(sampler.f, v_th * sampler.antialias, z_th, total)
+        own = 0.0 if self.electronics is None else self.electronics.converter_noise
+        own = math.hypot(own, step / math.sqrt(12))
+        noise = np.hypot(sigma * self.colour(sampler.f), own) / self.scale
+        total = math.hypot(sigma, own) / self.scale
+        return Waveform(sampler.f, v_th * sampler.antialias, z_th, noise, total)
+
+    def colour(self, f: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
+        """Amplitude of the noise of `snr_db` at frequencies [Hz], relative to white noise."""
+        if self.electronics is None:
+            return np.ones(f.shape)
+        corner = self.antialias * self.sample_rate
+        return np.sqrt(self.electronics.noise_power(f, corner, self.sample_rate))
+
+    def noise(
+        self, rng: np.random.Generator, shape: tuple[int, ...]
+    ) -> Float[np.ndarray, "*record time"]:
+        """Noise of records without their rounding, for a stream of one's own.
+
+        Args:
+            rng: Source of random numbers.
+            shape: Of the records; the last axis is time.
+
+        Returns:
+            Records [V].
+        """
+        *_, sigma = self._exact()
+        noise = self._noise(rng, sigma, shape)
+        if self.electronics is not None:
+            noise = noise + self.electronics.converter_noise * rng.standard_normal(shape)
+        return noise / self.scale
+
+    def _noise(
+        self, rng: np.random.Generator, sigma: float, shape: tuple[int, ...]
+    ) -> Float[np.ndarray, "*record time"]:
+        """The noise of `snr_db`, in the unit of its standard deviation."""
+        if self.electronics is None:
+            return sigma * rng.standard_normal(shape)
+        corner = self.antialias * self.sample_rate
+        return self.electronics.noise(rng, sigma, shape, corner, self.sample_rate)
 
     def current_noise(self, current: Complex[np.ndarray, " f"]) -> float:
         """Standard deviation of the noise of a recorded current.
@@ -300,7 +353,7 @@ class Scene(Overviewed):
         delay = self.trigger_jitter_rms * rng.standard_normal()
         noise = self.current_noise(coefficients * sampler.antialias)
         exact = sampler.sample(coefficients, self.samples, self.start + delay)
-        return exact + noise * rng.standard_normal(self.samples)
+        return exact + self._noise(rng, noise, (self.samples,))
 
     def _exact(self) -> tuple[Sampler, np.ndarray, np.ndarray, float]:
         """Sampler, Fourier coefficients of V_th [V], Z_th [ohm] and noise [V at the converter]."""
@@ -308,6 +361,7 @@ class Scene(Overviewed):
             self.sample_rate,
             self.pulse_rate * (1 + 1e-6 * self.pulse_rate_ppm),
             self.antialias * self.sample_rate,
+            self.electronics,
         )
         v_th = sampler.pulse_rate * self.driver.v_th_spectrum(sampler.f)
         sigma = 0.0
@@ -333,9 +387,15 @@ class Scene(Overviewed):
         # Draw also if the factor is 0: scenes with and without an effect then have the same noise.
         delay = self.trigger_jitter_rms * rng.standard_normal()
         offset = self.offset_rms * rng.standard_normal()
-        noise = sigma * rng.standard_normal(self.samples)
         volts = self.scale * sampler.sample(coefficients, self.samples, self.start + delay)
-        volts += offset + noise
+        volts += offset
+        if self.electronics is None:
+            volts += sigma * rng.standard_normal(self.samples)
+        else:
+            corner = self.antialias * self.sample_rate
+            volts = self.electronics.measured(
+                volts, rng, sigma, corner, self.sample_rate, self.full_scale
+            )
         step, lowest, highest = self._converter()
         if self.bits is None:
             return Samples(np.clip(volts, lowest, highest), 1 / self.scale)

@@ -27,17 +27,13 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.display import quantity
+from etid.simulation.electronics import Electronics
 
 Impedance = Callable[[Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]]
 """A load: a function from frequencies [Hz] to impedance [ohm]."""
 
-# Harmonics are summed up to this multiple of the anti-alias corner, where the gain of the filter is
-# 3e-6. Higher harmonics add less than 1e-6 V to a 50 V pulse, 1/1000 of a 16-bit step.
-_BANDWIDTH = 25
 # [samples] Longest repeating block for one inverse FFT; a longer block is summed directly.
 _MAX_BLOCK = 1_000_000
-# Harmonics per step of the direct sum; limits the memory to 2·chunk·sqrt(samples) numbers.
-_CHUNK = 4096
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,7 +206,7 @@ def loading(
 
 
 class Sampler:
-    """Samples periodic waveforms exactly, after a 4th-order Butterworth anti-alias filter.
+    """Samples periodic waveforms exactly, after an anti-alias filter.
 
     v_n = Σ_k c_k H(k f_0) e^(j2π k f_0 t_n),   t_n = start + n / sample_rate,   k = ±1, ±2, …
 
@@ -221,17 +217,23 @@ class Sampler:
     Args:
         sample_rate: Samples per second [Hz].
         pulse_rate: Pulses per second f_0 [Hz].
-        corner: Half-power frequency of the anti-alias filter [Hz].
+        corner: Corner of the anti-alias filter [Hz].
+        electronics: Its type and order; Butterworth of 4th order if not given.
     """
 
-    def __init__(self, sample_rate: float, pulse_rate: float, corner: float) -> None:
+    def __init__(
+        self,
+        sample_rate: float,
+        pulse_rate: float,
+        corner: float,
+        electronics: Electronics | None = None,
+    ) -> None:
+        filtering = electronics or Electronics()
         self.sample_rate = sample_rate
         self.pulse_rate = pulse_rate
-        self.harmonics = np.arange(1, math.ceil(_BANDWIDTH * corner / pulse_rate) + 1)
+        self.harmonics = np.arange(1, math.ceil(filtering.reach(corner) / pulse_rate) + 1)
         self.f = self.harmonics * pulse_rate
-        s = 1j * self.f / corner
-        pairs = [s**2 + 2 * math.sin(math.pi * odd / 8) * s + 1 for odd in (1, 3)]
-        self.antialias = 1 / (pairs[0] * pairs[1])
+        self.antialias = filtering.response(self.f, corner)
 
     def rms(self, coefficients: Complex[np.ndarray, " f"]) -> float:
         """Effective value over one period of the voltage at the converter.
@@ -281,17 +283,16 @@ class Sampler:
     def _summed(self, c: Complex[np.ndarray, " f"], samples: int) -> Float[np.ndarray, " samples"]:
         """Direct sum of the harmonics, for rates without a short common block.
 
-        With n = i m + j the exponential is a product, e^(jωn) = e^(jωim) e^(jωj). The sum is then a
-        matrix product over the harmonics. Each harmonic needs 2 sqrt(samples) exponentials instead
-        of `samples`.
+        With 2kn = k² + n² − (k − n)² the sum is a convolution with a chirp (Bluestein 1970).
         """
-        m = math.isqrt(samples - 1) + 1
-        step = self.pulse_rate / self.sample_rate
-        total = np.zeros((math.ceil(samples / m), m))
-        for first in range(0, c.size, _CHUNK):
-            part = slice(first, first + _CHUNK)
-            turns = self.harmonics[part] * step
-            coarse = np.exp(2j * np.pi * np.outer(np.arange(total.shape[0]) * m, turns))
-            fine = np.exp(2j * np.pi * np.outer(turns, np.arange(m)))
-            total += 2 * np.real((coarse * c[part]) @ fine)
-        return total.ravel()[:samples]
+        first = self.harmonics[-1]
+        lag = np.arange(-first, samples)
+        # Phases of 1e8 turns keep 1e-11 of a turn in extended precision.
+        turns = (
+            np.longdouble(self.pulse_rate) / self.sample_rate / 2 * lag.astype(np.longdouble) ** 2
+        )
+        chirp = np.exp(2j * np.pi * np.remainder(turns, 1).astype(float))
+        own = np.concatenate([[0.0], c * chirp[first - self.harmonics]])
+        size = 2 ** math.ceil(math.log2(lag.size + first))
+        folded = np.fft.ifft(np.fft.fft(own, size) * np.fft.fft(np.conj(chirp), size))
+        return 2 * np.real(folded[first : first + samples] * chirp[first:])
