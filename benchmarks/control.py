@@ -17,6 +17,7 @@ the standard error of the charge of the last pulse. They excuse none.
 """
 
 import argparse
+import math
 import pathlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -31,7 +32,7 @@ import etid
 from benchmarks import control_hazards, control_loop, ngspice
 from benchmarks.charts import INK, new_figure, save
 from benchmarks.control_plant import KINDS, OLDER, Display, Fingertip, by_ngspice, closed_loop
-from benchmarks.ladder import TWO
+from benchmarks.ladder import BEFORE, TWO, WHITE
 from benchmarks.machine import RESULTS, write_csv
 from benchmarks.runner import Target, at_most, option, report, show
 from etid.estimators.unknowns import LoadUnknowns
@@ -44,6 +45,7 @@ WANTED = 80e-9  # [C] per phase
 CAP = 5e-3  # [A]
 FALLBACK = 0.3  # of the amplitude of the unloaded record
 CHANGE = 6e-3  # random walk that the tracker expects [1/√pulse], about as fast as sweating
+PART = 4  # of the pulses of hazards, with noise before the filter
 NEAR = 0.02  # relative error of a charge that meets the target
 TARGETS = {
     f"pulses that miss the charge by more than {NEAR:.0%}": at_most(0),
@@ -108,12 +110,14 @@ def loop(arguments: argparse.Namespace) -> Sequence[Target]:
 
 def hazards(arguments: argparse.Namespace) -> Iterator[Target]:
     """Print and write the pulses above the cap; the targets of all cells together."""
-    rows = []
-    for seed, snr in enumerate(arguments.snr):
-        found = control_hazards.Hazards(snr, seed)
+    rows, most = [], arguments.hazard_pulses
+    runs = [(snr, WHITE, most) for snr in arguments.snr]
+    runs.append((arguments.snr[0], BEFORE, math.ceil(most / PART)))
+    for seed, (snr, noise, pulses) in enumerate(runs):
+        found = control_hazards.Hazards(snr, seed, electronics=noise)
         controller = found.controller(arguments.hazard_electrodes)
-        given = found.given(controller, control_hazards.CELLS, arguments.hazard_pulses)
-        rows += [of.row(snr, cell) for cell, of in given.items()]
+        given = found.given(controller, control_hazards.CELLS, pulses)
+        rows += [of.row(snr, cell, noise) for cell, of in given.items()]
     for row in rows:
         show(row)
     write_csv(arguments.output.with_suffix(".csv"), rows)

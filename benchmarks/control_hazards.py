@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 
 import etid
 from benchmarks.control_plant import Display, Load, closed_loop
-from benchmarks.ladder import TWO
+from benchmarks.ladder import ELECTRONICS, TWO, WHITE
 from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
@@ -177,7 +177,7 @@ class Given:
     worst: Float[np.ndarray, "pulse lane"]  # largest charge that the command stated [C]
     reason: np.ndarray  # what determined the amplitude
 
-    def row(self, snr: float, cell: str) -> dict[str, Any]:
+    def row(self, snr: float, cell: str, noise: str = WHITE) -> dict[str, Any]:
         """What the cell shows, as a row of the table."""
         above, reasons = (
             self.charge > CAP,
@@ -188,6 +188,7 @@ class Given:
         unseen = above & (seen <= CAP)
         return {
             "snr_db": snr,
+            "noise": noise,
             "cell": cell,
             "pulses": self.charge.size,
             "above_after_unseen_change": int(unseen.sum()),
@@ -201,8 +202,11 @@ class Given:
 class Hazards:
     """A calibrated driver, and the loads that its display meets."""
 
-    def __init__(self, snr: float, seed: int, samples: int = 40_000) -> None:
-        scene = Scene((), TWO, samples=samples, snr_db=snr, trigger_jitter_rms=100e-9)
+    def __init__(
+        self, snr: float, seed: int, samples: int = 40_000, electronics: str = WHITE
+    ) -> None:
+        usual = {"samples": samples, "trigger_jitter_rms": 100e-9}
+        scene = Scene((), TWO, snr_db=snr, **usual, **ELECTRONICS[electronics])
         self.records = list(scene.simulate(seed=seed).calibrations.recordings())
         self.driver = etid.identify_driver(self.records)
         self.rng = np.random.default_rng(seed)

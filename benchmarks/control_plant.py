@@ -19,10 +19,11 @@ from tqdm import tqdm
 
 import etid
 from benchmarks import ngspice
+from benchmarks.laboratory import drawn_noise
 from etid.online.controller import Command
 from etid.online.state import TrackerState
 from etid.simulation.published import TYPICAL
-from etid.simulation.scenes import Scene
+from etid.simulation.scenes import Electronics, Scene
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
 
 FINE = 12  # points per sample; a third of a sample must be whole points
@@ -76,14 +77,14 @@ class Display:
     def __init__(
         self, scene: Scene, loads: Sequence[Load], seed: int, source: Source = by_circuit
     ) -> None:
-        self.rng = np.random.default_rng(seed)
+        self.rng, self.scene = np.random.default_rng(seed), scene
         rate, period = scene.sample_rate * FINE, scene.sample_rate / scene.pulse_rate
         self.size, self.step = round(period), scene.full_scale / 2**15 / scene.scale
         unloaded, _ = source(scene, OpenLoad())
         points = unloaded.size
         time, f = np.arange(points) / rate, np.fft.rfftfreq(points, 1 / rate)
-        s = 1j * f / (scene.antialias * scene.sample_rate)
-        filtered = 1 / np.prod([s**2 + 2 * np.sin(np.pi * of / 8) * s + 1 for of in (1, 3)], axis=0)
+        filtering, corner = scene.electronics or Electronics(), scene.antialias * scene.sample_rate
+        filtered = filtering.response(f, corner)
         late = filtered * np.exp(2j * np.pi * f * DELAYS[:, None])
 
         top, below = int(np.argmax(unloaded)), np.flatnonzero(unloaded <= 0)
@@ -124,7 +125,7 @@ class Display:
         """What the converter records of pulse `number` [V]; the other arguments as `charges`."""
         third = (1, 0, 2)[number % 3]  # a window begins at the sample nearest to its period
         delay = self.rng.integers(DELAYS.size, size=load.size)
-        v = self.sigma * self.rng.standard_normal((load.size, self.size), dtype=np.float32)
+        v = drawn_noise(self.scene, self.sigma, self.rng, (load.size, self.size))
         newest = amplitude[: self.older].astype(np.float32)
         for at in range(load.size):
             v[at] += newest[:, at] @ self.voltage[load[at]][delay[at], third]

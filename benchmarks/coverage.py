@@ -5,6 +5,8 @@ trial, and identifies a driver of its own: trials that share a driver share its 
 `--current-snr-db` the loads are identified from the current alone; with `--resistors` too, from
 driver and current at once.
 
+Noise is white by default; what `--electronics` names beside that is drawn a fifth as often.
+
 The part of the 95 % intervals that hold the truth, and the root mean square of z = error / standard
 error, stand beside the ranges into which 99 of 100 runs with right standard errors fall. The target
 is of all elements of a load: a single one scatters by 1.5 % with 200 draws.
@@ -13,6 +15,7 @@ is of all elements of a load: a single one scatters by 1.5 % with 200 draws.
 import argparse
 import dataclasses
 import json
+import math
 import pathlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -22,7 +25,7 @@ from tqdm import tqdm
 
 import etid
 from benchmarks.estimators import DEFAULT, Drivers, found_by
-from benchmarks.ladder import LOADS, recorded
+from benchmarks.ladder import BEFORE, ELECTRONICS, LOADS, WHITE, recorded
 from benchmarks.perturbed_study import drawn_driver
 from benchmarks.rates import COVERED, NORMAL_95, covered, expected_covered, expected_rms
 from benchmarks.runner import Target, at_most, option, report
@@ -40,11 +43,13 @@ TARGETS = {
 HEADS = (
     "load      element   bias %  spread %      sd %   bound %  efficiency  covered  rms z  max |z|"
 )
+PART = 5  # of the repetitions, for what is not white noise
 MORE = "more"  # trials that take part in a joint fit, but share its errors and are not counted
 
 OPTIONS = (
     option("--snr-db", default=(60.0,)),
     option("--repetitions", default=200),
+    option("--electronics", default=(WHITE, BEFORE), choices=ELECTRONICS),
     option("--jitter", default=50e-9, help="rms trigger delay [s]"),
     option("--resistors", type=float, nargs="+", help="of the calibrations [ohm]"),
     option("--current-snr-db", type=float, help="identify from a measured current with this noise"),
@@ -99,6 +104,7 @@ def scene(
     shared_v_th: bool = False,
     more: int = 0,
     current_snr_db: float | None = None,
+    electronics: str = WHITE,
 ) -> Scene:
     """A dry and a damp fingertip behind the default transformer, and `more` trials of each."""
     every = LOADS | {f"{MORE}/{n}{i}": load for n, load in LOADS.items() for i in range(more)}
@@ -110,6 +116,7 @@ def scene(
         current_snr_db=current_snr_db,
         trigger_jitter_rms=jitter,
         shared_v_th=shared_v_th,
+        **ELECTRONICS[electronics],
     )
 
 
@@ -224,14 +231,16 @@ def main(arguments: argparse.Namespace) -> bool:
         current = arguments.current_snr_db
         resistors = arguments.resistors or ([REFERENCE] if current is None else [])
         scenes = {
-            f"{snr_db:g} dB": scene(
+            f"{snr_db:g} dB{'' if name == WHITE else f', {name}'}": scene(
                 snr_db,
                 10_000,
                 resistors,
                 arguments.jitter,
                 more=arguments.more,
                 current_snr_db=current,
+                electronics=name,
             )
+            for name in arguments.electronics
             for snr_db in arguments.snr_db
         }
     asked = list[Target]()
@@ -240,7 +249,9 @@ def main(arguments: argparse.Namespace) -> bool:
         bounds, drivers = etid.bound(drawn), Drivers()
         for method in arguments.method:
             by = None if method == DEFAULT else method
-            found = monte_carlo(drawn, arguments.repetitions, by, arguments.parts, drivers)
+            most = arguments.repetitions
+            count = most if drawn.electronics is None else math.ceil(most / PART)
+            found = monte_carlo(drawn, count, by, arguments.parts, drivers)
             for name, of in found.items():
                 print("\n".join(lines(name, of, bounds[name].relative)))
                 asked += targets(f"{of_scene}, {name}, {method}", of)

@@ -1,4 +1,4 @@
-"""Where methods may fail: nine pairs of axes, and the scene of every cell.
+"""Where methods may fail: ten pairs of axes, and the scene of every cell.
 
 Every cell differs from the middle of the ladder in its row and its column. It has one calibration,
 and trials with dry and damp skin by turns, which share the driver identified from it.
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Complex, Float
 
-from benchmarks.ladder import LOADS, recorded
+from benchmarks.ladder import ELECTRONICS, LOADS, WHITE, recorded
 from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.recordings.recording import Recording, Samples
 from etid.simulation.scenes import Scene
@@ -247,3 +247,8 @@ def cells() -> Iterator[Cell]:
         skin = scene(snr_db=float(snr))
         chart, row = "SNR and circuit fitted to skin", f"{snr} dB"
         yield Cell(chart, row, "resistor", skin, circuit=Resistor())
+    for snr in SNR_DB:
+        for name, settings in ELECTRONICS.items():
+            if name != WHITE:
+                place = "SNR and instrument", f"{snr} dB", name.replace("_", " ")
+                yield Cell(*place, scene(snr_db=float(snr), **settings))

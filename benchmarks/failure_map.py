@@ -1,4 +1,4 @@
-"""Where each method fails, and whether it says so: maps over nine pairs of axes.
+"""Where each method fails, and whether it says so: maps over ten pairs of axes.
 
 `benchmarks.estimators` defines wrong and silent, `benchmarks.rates` the intervals. Written are
 `failures.csv`, one row for each cell and method; `silent_failures.csv`, each silent failure with

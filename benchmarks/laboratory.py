@@ -3,7 +3,9 @@
 The waveforms are the exact ones of `etid.simulation.transformer`:
 
     pulses → driver and load → gain → anti-alias filter → sampling → · scale → + added voltages
-    + white noise → rounding to a code, clipped at the full scale.
+    + noise → rounding to a code, clipped at the full scale.
+
+The noise is white, or that of the electronics of an instrument.
 
 Where the load differs from pulse to pulse, the records of each load are joined between the pulses.
 The voltage is at rest there but for the 2 % of the droop that the transformer has left.
@@ -19,7 +21,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.recordings.recording import Recording, Samples
-from etid.simulation.scenes import Scene
+from etid.simulation.scenes import Electronics, Scene
 from etid.simulation.transformer import (
     Impedance,
     OpenLoad,
@@ -56,6 +58,8 @@ class Output:
     # corner of a further filter of first order before the converter [Hz], if any
     lowpass: float | None = None
     antialias: float = CORNER  # corner of the anti-alias filter, relative to the sample rate
+    # what the voltage passes, with noise before the filter; white noise behind it if not given
+    electronics: Electronics | None = None
     sampling_jitter: float = 0.0  # standard deviation of the time of every single sample [s]
     added: tuple[Added, ...] = ()  # voltages that are added at the converter
     # coefficients of the terminal voltage by sampler, where the load is not linear
@@ -67,7 +71,8 @@ class Output:
 
     def sampler(self, sample_rate: float) -> Sampler:
         """Samples its waveform."""
-        return _sampler(sample_rate, self.pulse_rate / self.over, self.antialias)
+        rates = sample_rate, self.pulse_rate / self.over
+        return _sampler(*rates, self.antialias, self.electronics)
 
     def coefficients(self, load: Impedance, sampler: Sampler) -> Complex[np.ndarray, " f"]:
         """Fourier coefficients [V] with a load, before the anti-alias filter."""
@@ -154,7 +159,11 @@ class Record:
     def _stored(self, output: Output, rng: np.random.Generator) -> Samples:
         noise, other = rng.spawn(2)
         volts = output.volts(self.sample_rate, self.samples, other)
-        volts = volts + self.sigma * noise.standard_normal(self.samples)
+        if output.electronics is None:
+            volts = volts + self.sigma * noise.standard_normal(self.samples)
+        else:
+            rates = output.antialias * self.sample_rate, self.sample_rate
+            volts = output.electronics.measured(volts, noise, self.sigma, *rates, self.full_scale)
         half = 2 ** (self.bits - 1)
         step = self.full_scale / half
         codes = np.clip(np.rint(volts / step), -half, half - 1)
@@ -164,12 +173,17 @@ class Record:
             )
         if not self.codes:
             return Samples(codes * step / SCALE)
-        return Samples(codes.astype(np.int16), step / SCALE)
+        return Samples(codes.astype(np.int16 if self.bits <= 16 else np.int32), step / SCALE)
 
 
 @functools.lru_cache(maxsize=16)
-def _sampler(sample_rate: float, pulse_rate: float, antialias: float = CORNER) -> Sampler:
-    return Sampler(sample_rate, pulse_rate, antialias * sample_rate)
+def _sampler(
+    sample_rate: float,
+    pulse_rate: float,
+    antialias: float = CORNER,
+    electronics: Electronics | None = None,
+) -> Sampler:
+    return Sampler(sample_rate, pulse_rate, antialias * sample_rate, electronics)
 
 
 @functools.lru_cache(maxsize=64)
@@ -184,6 +198,16 @@ def noise(driver: TransformerDriver, sample_rate: float, snr_db: float) -> float
     """Standard deviation of white noise [V at the converter], as `Scene.snr_db` defines it."""
     sampler = _sampler(sample_rate, 60.0)
     return SCALE * sampler.rms(_thevenin(driver, sampler)[0]) * 10 ** (-snr_db / 20)
+
+
+def drawn_noise(
+    scene: Scene, sigma: float, rng: np.random.Generator, shape: tuple[int, ...]
+) -> Float[np.ndarray, "*record time"]:
+    """Noise of records of a scene, in the unit of the standard deviation of a sample."""
+    if scene.electronics is None:
+        return sigma * rng.standard_normal(shape, np.float32)
+    corner = scene.antialias * scene.sample_rate
+    return scene.electronics.noise(rng, sigma, shape, corner, scene.sample_rate)
 
 
 def hum(

@@ -12,7 +12,7 @@ from benchmarks import ngspice
 from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.study import Study
 from etid.simulation.published import REFERENCE, TYPICAL
-from etid.simulation.scenes import Scene, Trial
+from etid.simulation.scenes import INSTRUMENTS, Electronics, Scene, Trial
 from etid.simulation.transformer import Impedance, ResistorLoad
 
 LOADS = TYPICAL
@@ -29,6 +29,14 @@ SOURCES: Mapping[str, Callable[[Scene, int], Study]] = {
     "spice": ngspice.record,
 }
 JITTER = {"no delays": 0.0, "delays of 500 ns": 500e-9}
+
+# Settings of a scene: noise as behind the filter, noise of an amplifier before it, instruments.
+WHITE, BEFORE = "white", "before_the_filter"
+ELECTRONICS: Mapping[str, Mapping[str, Any]] = {
+    WHITE: {},
+    BEFORE: {"electronics": Electronics()},
+    **INSTRUMENTS,
+}
 
 
 def recorded(

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
+from benchmarks.ladder import BEFORE, WHITE
 from benchmarks.machine import RESULTS
 from benchmarks.online_alarms import LOADS, SOON, Fingertip, alarms
 from benchmarks.rivals import RivalError, exchange
@@ -37,13 +38,13 @@ OFF = 0.05  # of the elements, by which its start differs from what the tracker 
 WARM = 50  # ticks before the first that counts: compilation, and the start of every electrode
 KINDS = 60  # different pulses, over and over
 OFFSET = 1e-6  # [V] from pulse to pulse: bits that come back would be an old window
-NOISES = (60.0, 40.0)  # [dB] of the false alarms; the ticks have the first
+NOISES = ((60.0, WHITE), (40.0, WHITE), (60.0, BEFORE))  # [dB] of the alarms; ticks: the first
 CHANGE = 1e-3  # random walk that the tracker expects in the ticks [1/√pulse]
 
 OPTIONS = (
     option("--electrodes", default=98),
     option("--ticks", default=2000),
-    option("--hours", default=4.0, help="electrode hours of false alarms; 0 for none"),
+    option("--hours", default=3.2, help="electrode hours of false alarms; 0 for none"),
     option("-o", "--output", default=RESULTS / "online.csv"),
 )
 
@@ -51,9 +52,10 @@ OPTIONS = (
 def main(arguments: argparse.Namespace) -> bool:
     electrodes, hours = arguments.electrodes, arguments.hours
     found = list(ticks(electrodes, arguments.ticks))
-    for snr_db in NOISES if hours > 0 else ():
-        counts = alarms(electrodes, snr_db, hours).items()
-        found += [Target.of(TARGETS, *of, f"{snr_db:g} dB: ") for of in counts]
+    for snr_db, noise in NOISES if hours > 0 else ():
+        counts = alarms(electrodes, snr_db, hours, noise).items()
+        at = f"{snr_db:g} dB{'' if noise == WHITE else f', {noise}'}: "
+        found += [Target.of(TARGETS, *of, at) for of in counts]
     return report(found, arguments.output)
 
 
@@ -98,7 +100,7 @@ def timed(
 
 def problem(electrodes: int) -> tuple[etid.Tracker, np.ndarray]:
     """A tracker, and pulses for it (pulse, electrode, sample)."""
-    display, loads = Fingertip(electrodes, NOISES[0], CHANGE), np.arange(electrodes) % len(LOADS)
+    display, loads = Fingertip(electrodes, NOISES[0][0], CHANGE), np.arange(electrodes) % len(LOADS)
     return display.tracker, np.stack([*display.pulses(loads, KINDS)])
 
 

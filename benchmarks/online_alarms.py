@@ -16,7 +16,8 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
-from benchmarks.ladder import TWO
+from benchmarks.laboratory import drawn_noise
+from benchmarks.ladder import ELECTRONICS, TWO, WHITE
 from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene, Trial
 
@@ -33,14 +34,17 @@ SOON = 2  # pulses within which the change must be found
 class Fingertip:
     """Pulses of a display at one noise; `change` is the random walk that the tracker expects."""
 
-    def __init__(self, electrodes: int, snr_db: float, change: float = 0.0) -> None:
-        noisy = Scene((), TWO, snr_db=snr_db, trigger_jitter_rms=JITTER, samples=UNLOADED)
+    def __init__(
+        self, electrodes: int, snr_db: float, change: float = 0.0, electronics: str = WHITE
+    ) -> None:
+        usual = {"trigger_jitter_rms": JITTER, "samples": UNLOADED}
+        noisy = Scene((), TWO, snr_db=snr_db, **usual, **ELECTRONICS[electronics])
         calibrations = list(noisy.simulate(seed=0).calibrations.recordings())
         driver = etid.identify_driver(calibrations)
         self.tracker = etid.Tracker.of(
             driver, calibrations[0], electrodes=electrodes, change=change
         )
-        self.sigma = noisy.waveform().sigma
+        self.noisy, self.sigma = noisy, noisy.waveform().sigma
         trials = [
             Trial(f"{at}/{draw}", load) for at, load in enumerate(LOADS) for draw in range(DRAWS)
         ]
@@ -56,15 +60,17 @@ class Fingertip:
         """The next pulse, for the number of the load at each electrode [V]."""
         draws = self.rng.integers(DRAWS, size=loads.size)
         clean = self.windows[number % len(self.windows), loads, draws]
-        return clean + self.sigma * self.rng.standard_normal(clean.shape, np.float32)
+        return clean + drawn_noise(self.noisy, self.sigma, self.rng, clean.shape)
 
     def pulses(self, loads: np.ndarray, number: int) -> Iterator[Float[np.ndarray, "lane sample"]]:
         return (self.pulse(at, loads) for at in range(number))
 
 
-def alarms(electrodes: int, snr_db: float, hours: float) -> dict[str, float]:
+def alarms(
+    electrodes: int, snr_db: float, hours: float, electronics: str = WHITE
+) -> dict[str, float]:
     """What the tests for changes show in so many electrode hours, and after a change."""
-    display = Fingertip(electrodes, snr_db)
+    display = Fingertip(electrodes, snr_db, electronics=electronics)
     tracker = display.tracker
     loads = np.arange(electrodes) % len(LOADS)
     hourly = 3600 * tracker.model.bands.sample_rate / tracker.period

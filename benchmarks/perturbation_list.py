@@ -18,7 +18,7 @@ from benchmarks import perturbed_study as lab
 from benchmarks import visibility
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.laboratory import hum, inductive, leaky, offset, pink, spike
-from benchmarks.ladder import LOADS
+from benchmarks.ladder import ELECTRONICS, LOADS, WHITE
 from benchmarks.perturbed_study import Change, all_records, both, calibrations, out, th, trials
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 
@@ -33,6 +33,11 @@ UNDISTURBED: Mapping[str, Change] = {
     "base_begins_in_a_pulse": lab.beginning(0.3e-3),
     "base_begins_on_the_tail_of_a_pulse": lab.beginning(0.8e-3),
     "base_pulses_of_4_ms": lab.wide(4e-3),
+    **{
+        f"base_{name}": lab.lasting(SIX, lab.instrument(name))
+        for name in ELECTRONICS
+        if name != WHITE
+    },
 }
 """Studies in which all is well: hardly any of them may be refused."""
 

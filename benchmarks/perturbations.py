@@ -83,10 +83,17 @@ def error_of(values: np.ndarray, truth: Truth, remarked: bool) -> np.ndarray:
     return np.where(np.isnan(truth.low), 0.0, error)
 
 
+def _bound(of: Record, snr_db: float) -> np.ndarray:
+    """Bounds of the undisturbed scene with this noise and converter."""
+    own = {name: getattr(of, name) for name in ("samples", "bits", "full_scale")}
+    if of.out.electronics is not None:
+        own |= {"electronics": of.out.electronics, "antialias": of.out.antialias}
+    return _bounds(snr_db=snr_db, **own)[of.path]
+
+
 @functools.cache
-def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[str, np.ndarray]:
-    """Bounds of the undisturbed scene with this noise and converter, by path."""
-    scene = recorded(LOADS, snr_db=snr_db, samples=samples, bits=bits, full_scale=full_scale)
+def _bounds(**settings: Any) -> dict[str, np.ndarray]:
+    scene = recorded(LOADS, **settings)
     return {path: np.array(list(of.relative.values())) for path, of in etid.bound(scene).items()}
 
 
@@ -107,7 +114,7 @@ def answers_of(names: Sequence[str], number: int, snr_db: float, parts: float) -
                 *(DEFAULT, number, of.path, verdict),
                 error=error_of(values, truth, fit is not None and int(fit.remarks) != 0),
                 stderr=stderr / ((truth.low + truth.high) / 2),
-                bound=_bounds(snr_db, of.samples, of.bits, of.full_scale)[of.path],
+                bound=_bound(of, snr_db),
                 exact=not truth.words,
                 perturbation=name,
                 snr_db=snr_db,

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 import etid
 from benchmarks.laboratory import CORNER, SCALE, Nonlinear, Output, Record, exponential, noise
-from benchmarks.ladder import LOADS
+from benchmarks.ladder import ELECTRONICS, LOADS
 from etid.simulation.published import REFERENCE
 from etid.simulation.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
 
@@ -240,6 +240,17 @@ def second_resistor(factor: float) -> Change:
 def lasting(samples: int, change: Change = lambda study: study) -> Change:
     """Make records of another length."""
     return lambda study: change(all_records(record(samples=samples))(study))
+
+
+def instrument(name: str) -> Change:
+    """Record with one of `ELECTRONICS`; its offset is left out, which no harmonic shows."""
+    of = dict(ELECTRONICS[name])
+    of.pop("offset_rms", None)
+    rate = PULSE_RATE * (1 + 1e-6 * of.pop("pulse_rate_ppm", 0.0))
+    converter = {key: of.pop(key) for key in ("bits", "full_scale") if key in of}
+    return lambda study: all_records(
+        lambda one: record(**converter)(both(pulse_rate=rate, **of)(one))
+    )(study)
 
 
 def coherent(antialias: float = CORNER) -> Change:

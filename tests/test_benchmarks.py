@@ -90,7 +90,7 @@ SMALLER = {
     amplitude_errors: {"SCENES": amplitude_errors.SCENES[:1], "POINTS": 2**9},
     amplitudes: {"FINER": (4,), "REPEATS": 1},
     curves: {"LANES": (1, 2), "SAMPLES": (1_000,)},
-    online: {"WARM": 3, "NOISES": (60.0,), "KINDS": 3},
+    online: {"WARM": 3, "NOISES": ((60.0, "before_the_filter"),), "KINDS": 3},
     online_alarms: {"TIMES": 1},
     selection: {
         "FEW": Effort(1, 1), "FEW_PAIRS": 1, "FEW_DRIVERS": 1, "FEW_SNR": (60,), "STEP": 60,
