@@ -250,7 +250,7 @@ def main(arguments: argparse.Namespace) -> bool:
         for method in arguments.method:
             by = None if method == DEFAULT else method
             most = arguments.repetitions
-            count = most if drawn.electronics is None else math.ceil(most / PART)
+            count = most if drawn.electronics is None else max(2, math.ceil(most / PART))
             found = monte_carlo(drawn, count, by, arguments.parts, drivers)
             for name, of in found.items():
                 print("\n".join(lines(name, of, bounds[name].relative)))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks import perturbations, speed_accuracy, which
+from benchmarks import instruments, perturbations, speed_accuracy, which
 from benchmarks.estimators import NOTHING, Answer
 from benchmarks.laboratory import SCALE
 from benchmarks.ladder import LOADS
@@ -179,3 +179,31 @@ def test_large_files_follow_the_schema_in_all_layouts_and_are_made_once(tmp_path
     np.testing.assert_array_equal(stacks[0], stacks[1])
     np.testing.assert_array_equal(stacks[0], stacks[2])
     assert (stacks[0][0] != stacks[0][1]).any()
+
+
+def test_a_refused_good_recording_and_an_error_beyond_the_bound_miss_their_targets():
+    def one(seed, z, verdict="successful", name="delta_sigma_card", stderr=0.01):
+        errors = np.full(3, z * stderr), np.full(3, stderr)
+        of = {"bound": np.full(3, 0.01), "perturbation": name, "snr_db": 50.0, "chi2": 1.0}
+        return Answer("default", seed, "dry/0", verdict, *errors, **of)
+
+    def found(*every):
+        return {of.name: of for of in instruments.targets(every)}
+
+    # 95 % of the intervals have the truth, and the errors are as large as the bound.
+    usual = [one(seed, 2.5 if seed % 20 == 0 else 0.9) for seed in range(200)]
+    met = found(*usual)
+    assert all(of.met for of in met.values())
+    assert met["delta_sigma_card, r_p: covered"].value == pytest.approx(0.95)
+    worse = found(*usual, one(200, 0.0, "misfit"))
+    assert not worse["delta_sigma_card: good recordings refused"].met
+    assert worse["delta_sigma_card, r_p: covered"].met  # what is refused has no interval
+    wider = found(*[one(seed, 0.9, stderr=0.03) for seed in range(200)])
+    assert wider["delta_sigma_card: rms error / bound"].value == pytest.approx(2.7)
+    assert not wider["delta_sigma_card: rms error / bound"].met
+    silent = found(*usual, one(200, 5.5, name="filtered: order 2"))
+    assert not silent["filtered: silent"].met
+    of_data = found(*[one(i, 1.0, name="data: any") for i in range(29)])
+    assert not of_data["recordings of another simulator that are successful"].met
+    [row] = instruments.rows([one(0, 1.0), one(1, 3.0), one(2, 1.0, "misfit")])
+    assert (row["right"], row["refused"], row["r_s_covered"]) == (2, 1, 0.5)

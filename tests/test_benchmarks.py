@@ -52,6 +52,10 @@ CASES = {
     "design": ("", "", "times better than 60 Hz"),
     "driver_order": ("--drivers 1 --snr-db 60 --orders 5 7 --data {}", "", "100 % right"),
     "fuzz": ("--files 3 --kind csv --output {}/f.json", "f.json", "0 faults in 3 files"),
+    "instruments": (
+        "--quick --folder {0} --data {0}", "instruments.csv instruments.svg",
+        "oscilloscope_12_bit: rms error / bound",
+    ),
     "live": (
         "--electrodes 4 --minutes 0.02 --output {}/live.csv", "live.csv",
         "growth of the page's memory [MB]",
