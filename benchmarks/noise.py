@@ -2,9 +2,9 @@
 
 All records of `benchmarks.perturbed_study.undisturbed` get noise in addition to the white one: 1/f
 noise with a corner frequency, where both are equal, in both records or in that of V_out alone;
-white noise of three times the size in V_out; mains hum. For each, the verdicts, the median χ², the
-coverage (with the targets of `benchmarks.coverage`), and the median standard errors of R_s, R_p and
-C_p relative to those with white noise.
+white noise of three times the size in V_out; mains hum. Or their noise comes before the filter. For
+each, the verdicts, the median χ², the coverage (with the targets of `benchmarks.coverage`), and the
+median standard errors of R_s, R_p and C_p relative to those with white noise.
 """
 
 import argparse
@@ -18,6 +18,7 @@ from benchmarks.laboratory import Added, Flicker, Record, hum
 from benchmarks.ladder import TRUTH
 from benchmarks.perturbed_study import all_records, both, out, undisturbed
 from benchmarks.runner import Target, option, report
+from etid.simulation.scenes import Electronics
 
 FIRST = 2000  # number of the first driver
 HUM = 0.01  # [V at the converter]
@@ -36,6 +37,7 @@ KINDS: Mapping[str, Callable[[Record], Record]] = {
     "V_out three times as loud": lambda of: out(added=(white(8**0.5 * of.sigma),))(of),
     "hum of 50 Hz": lambda of: both(added=(hum(50.0, HUM),))(of),
     "hum of 60 Hz": lambda of: both(added=(hum(60.0, HUM),))(of),
+    "before the filter": lambda of: both(electronics=Electronics())(of),
 }
 
 

@@ -23,9 +23,10 @@ from benchmarks.perturbation_list import (
     change_of,
     pair,
 )
-from benchmarks.perturbed_study import undisturbed
+from benchmarks.perturbed_study import both, undisturbed
 from benchmarks.rates import COVERED, clopper_pearson, rate
 from benchmarks.runner import Target, report
+from etid.simulation import scenes
 from etid.simulation.scenes import Scene, Trial
 
 FEW_RECORDINGS = 12
@@ -150,6 +151,26 @@ def test_an_undisturbed_recording_is_that_of_a_scene():
         ours, other = getattr(found, name), getattr(theirs, name)
         # Both are the same voltage with white noise of one size: their difference is noise alone.
         assert np.std(ours - other) == pytest.approx(np.sqrt(2) * dry.sigma / SCALE, rel=0.03)
+    assert found.adc_range == pytest.approx(theirs.adc_range)
+    assert (found.sample_rate, found.pulse_rate) == (theirs.sample_rate, theirs.pulse_rate)
+
+
+@pytest.mark.parametrize("name", scenes.INSTRUMENTS)
+def test_an_instrument_of_the_laboratory_is_that_of_a_scene(name):
+    """Both without what is drawn: the same voltages behind the same filter, to a step."""
+    dry = both(delay=0.0)(PERTURBATIONS[f"base_{name}"](undisturbed(3, 60.0)).trials[0])
+    usual: scenes.Electronics = scenes.INSTRUMENTS[name]["electronics"]
+    steady = dataclasses.replace(usual, converter_noise=0.0, gain_drift=0.0)
+    found = dataclasses.replace(both(electronics=steady)(dry), sigma=0.0).recording(0)
+    settings: dict[str, Any] = {**scenes.INSTRUMENTS[name], "electronics": steady}
+    settings |= {"snr_db": None, "offset_rms": 0.0, "samples": 20_000}
+    of = Scene((Trial("dry", LOADS["dry"]),), driver=dry.out.driver, **settings)
+    theirs = of.simulate(0)["dry"]
+    step = theirs.samples["v_out"].resolution or 0.0
+    for voltage in ("v_th", "v_out"):
+        np.testing.assert_allclose(
+            getattr(found, voltage), getattr(theirs, voltage), rtol=0, atol=1.001 * step
+        )
     assert found.adc_range == pytest.approx(theirs.adc_range)
     assert (found.sample_rate, found.pulse_rate) == (theirs.sample_rate, theirs.pulse_rate)
 
