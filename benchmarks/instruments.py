@@ -15,6 +15,7 @@ recording is inspected before a fit (30 records of three periods together).
 
 import argparse
 import collections
+import dataclasses
 import pathlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import charts
-from benchmarks.estimators import ELEMENTS, Answer
+from benchmarks.estimators import ELEMENTS, NOTHING, Answer
 from benchmarks.instrument_draws import DATA_IS, FILTERED, answers, skins
 from benchmarks.ladder import LOADS, recorded
 from benchmarks.perturbations import KINDS, kind
@@ -68,6 +69,11 @@ OPTIONS = (
 )
 
 
+def judged(of: Answer) -> str:
+    """What an answer is, of `KINDS`, by its own standard errors only: 8 bits determine little."""
+    return kind(dataclasses.replace(of, bound=NOTHING))
+
+
 def inspection(records: int = 30, rounds: int = 15) -> float:
     """Median processor time of the inspection of a recording [ms]."""
     scene = recorded({f"{at}": LOADS["dry"] for at in range(records)}, {})
@@ -96,7 +102,7 @@ def rows(every: Sequence[Answer]) -> list[dict[str, Any]]:
 
 def row(key: tuple[str, float | str, str], of: Sequence[Answer]) -> dict[str, Any]:
     """What the answers of a group show together."""
-    counts = collections.Counter(map(kind, of))
+    counts = collections.Counter(map(judged, of))
     good = [one for one in of if one.successful]
     found: dict[str, Any] = dict(zip(("instrument", "snr_db", "skin"), key, strict=True))
     found |= {"answers": len(of)} | {one: counts[one] for one in KINDS}
@@ -133,7 +139,7 @@ def targets(every: Sequence[Answer]) -> Iterator[Target]:
             continue
         share = rate([not one.successful for one in of], [one.seed for one in of])
         yield Target.of(TARGETS, refused, share, f"{name}: ")
-        silent = sum(kind(one) == "silent" for one in of)
+        silent = sum(judged(one) == "silent" for one in of)
         yield Target.of(TARGETS, still, silent, f"{name}: ")
         good = [one for one in of if one.successful]
         if not good:

@@ -163,7 +163,7 @@ def test_an_instrument_of_the_laboratory_is_that_of_a_scene(name):
     steady = dataclasses.replace(usual, converter_noise=0.0, gain_drift=0.0)
     found = dataclasses.replace(both(electronics=steady)(dry), sigma=0.0).recording(0)
     settings: dict[str, Any] = {**scenes.INSTRUMENTS[name], "electronics": steady}
-    settings |= {"snr_db": None, "offset_rms": 0.0, "samples": 20_000}
+    settings |= {"snr_db": None, "offset_rms": 0.0, "samples": dry.samples}
     of = Scene((Trial("dry", LOADS["dry"]),), driver=dry.out.driver, **settings)
     theirs = of.simulate(0)["dry"]
     step = theirs.samples["v_out"].resolution or 0.0

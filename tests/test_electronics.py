@@ -117,6 +117,25 @@ def test_snr_is_that_of_the_noise_behind_the_filter():
     assert scene.waveform().sigma * scene.scale == pytest.approx(clean[0].std() / 100, rel=1e-6)
 
 
+def test_a_stream_gets_the_noise_of_the_records_without_their_rounding():
+    electronics = Electronics(filter_order=2, converter_noise=1e-3)
+    scene = of(electronics, load=OpenLoad(), snr_db=50.0)
+    noise = scene.noise(np.random.default_rng(0), (40, 1000))
+    relative = FIVE_SIGMA / np.sqrt(2 * 0.6 * noise.size)
+    assert noise.std() == pytest.approx(scene.waveform().sigma, rel=relative)
+    power = np.mean(np.abs(np.fft.rfft(noise)) ** 2, axis=0) / 1000
+    expected = np.interp(np.fft.rfftfreq(1000, 1 / RATE), *scene_noise(scene)) ** 2
+    bands = (power / expected)[:500].reshape(10, 50).mean(axis=1)
+    np.testing.assert_allclose(bands, 1.0, atol=FIVE_SIGMA / np.sqrt(40 * 50))
+
+
+def scene_noise(scene):
+    """Frequencies, and the noise of a scene there."""
+    waveform = scene.waveform()
+    inside = waveform.f < RATE / 2
+    return waveform.f[inside], waveform.noise[inside]
+
+
 def test_each_part_of_the_electronics_adds_what_it_says():
     noisy, clean = records(of(Electronics(converter_noise=1e-3), 20))
     relative = FIVE_SIGMA / np.sqrt(2 * noisy.size)

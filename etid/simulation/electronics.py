@@ -1,7 +1,7 @@
 """What stands between the terminal and the file: an amplifier, its filter and a converter.
 
-    → + hum → · scale → + noise of the amplifier → anti-alias filter → · gain → nonlinearity
-    → + noise of the converter
+    · scale → + noise of the amplifier → anti-alias filter → sampling → + offset → + hum → · gain
+    → nonlinearity → + noise of the converter → rounding to a code, clipped at the full scale
 
 The noise of the amplifier is white, with 1/f noise below a corner. It passes the same analog filter
 as the signal, and sampling folds what is left above half the sample rate. A sampled record of it is
@@ -232,10 +232,10 @@ INSTRUMENTS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
         # Tektronix DPO3000, 8 bits: MSO3000 and DPO3000 Series Oscilloscopes User Manual, Warranted
         # Specifications: with the limit of 20 MHz, noise and rounding together below 5 % of a
-        # division, here half of that; clock 10 ppm. INL below one step: TDS5000B Series
-        # Specifications, table 1-2. Ten divisions of 0.8 V.
+        # division, here 2.2 %, noise of half a step; clock 10 ppm. INL below one step: TDS5000B
+        # Series Specifications, table 1-2. Ten divisions of 0.8 V.
         "oscilloscope_8_bit": {
-            "electronics": Electronics(converter_noise=0.02, nonlinearity=1 / 128),
+            "electronics": Electronics(converter_noise=0.015, nonlinearity=1 / 128),
             "antialias": 5.0,  # a pulse has nothing above 1 MHz, and noise is folded
             "pulse_rate_ppm": -10.0,
             "bits": 8,
