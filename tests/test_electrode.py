@@ -17,6 +17,7 @@ from etid.online import alarms, tick
 from etid.online import state as states
 from etid.online.alarms import SEEN_IN_PULSES, PulseScores
 from etid.online.gain_bands import Bands
+from etid.online.noise import Noise
 from etid.online.projection import Seen
 from etid.online.pulse_fit import Expected, GainModel
 from etid.online.repeats import Windows
@@ -105,6 +106,7 @@ def electrode(of: Case) -> tuple[Any, ...]:
         gain=np.zeros(1, complex),
         variance=1.4,
         weight=np.array([1.5, 0.5]),
+        line=np.zeros(0),
         level=1.3,
         amplitude=0.0 if of.silent else 2.0,
         offset=1.25,
@@ -115,10 +117,11 @@ def electrode(of: Case) -> tuple[Any, ...]:
     sums = [[-150.0 if of.gain else 1.0, 90.0, 2.0], [1.0, 1.0, 0.0]]
     scores = SCORES(np.array(sums), np.array([0.5, -8.0]))
     result = GOOD if of.found else BAD
-    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, result, scores)
+    noise = np.zeros(4), np.zeros((0, 4))
+    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, result, scores, *noise)
     own = np.array([*(OLD[:2] + 1e-3), 0.3]) if of.near else FRESH
     result = RESULT[of.fresh]
-    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, result, scores)
+    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, result, scores, *noise)
     z = np.array([0.1, 0.2])
     again = not of.running or of.jump or of.drift
     suspected = SUSPICION(of.jump, of.drift, again, np.array([0.7, 0.8]), 0.02 * BEFORE, 0, z)
@@ -239,6 +242,7 @@ class Minimum(NamedTuple):
 
     squares: Any
     curvature: Any = jnp.array([[50.0, 4.0, 3.0], [4.0, 40.0, -2.0], [3.0, -2.0, 9.0]])
+    matrix: Any = jnp.eye(3)
 
 
 def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
@@ -263,7 +267,9 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
     object.__setattr__(model, "noise_freedom", jnp.asarray(1000.0))
     monkeypatch.setattr(PulseScores, "of", lambda *_: nothing)
     monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
-    monkeypatch.setattr("etid.online.tick.Pulse", lambda *_: None)
+    monkeypatch.setattr(GainModel, "patterns", lambda *_: jnp.zeros((0, 6)))
+    pulse = types.SimpleNamespace(jacobian=lambda *_: jnp.zeros((3, 6)))
+    monkeypatch.setattr("etid.online.tick.Pulse", lambda *_: pulse)
 
     @jax.jit
     @jax.vmap
@@ -273,7 +279,16 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
         monkeypatch.setattr("etid.online.tick.minimum", lambda *_: found)
         variance, level, one = jnp.asarray(0.01), jnp.asarray(0.5), jnp.asarray(1.0)
         measured = Measured(
-            jnp.asarray(gain), variance, jnp.asarray(weight), level, one, zero, one > 0, one, bad
+            jnp.asarray(gain),
+            variance,
+            jnp.asarray(weight / 0.01),
+            jnp.zeros(0),
+            level,
+            one,
+            zero,
+            one > 0,
+            one,
+            bad,
         )
         none = jnp.zeros(3, complex)
         expected = Expected(none, jnp.zeros((2, 3), complex), none, none)
@@ -404,7 +419,8 @@ def state_of(**fields: Any) -> TrackerState:
     lanes |= {name: jnp.asarray(value) for name, value in fields.items()}
     no = jnp.asarray(False)
     empty = Windows(slice(0), np.zeros((0, 1), np.uint64), np.zeros((0, 1), np.uint32))
-    return TrackerState(ElectrodeState(**lanes), jnp.asarray(100), no, no, empty)
+    noise = Noise.of(jnp.ones(2), 0, 1.0, count)
+    return TrackerState(ElectrodeState(**lanes), noise, jnp.asarray(100), no, no, empty)
 
 
 def test_what_a_pulse_has_shown_is_listed():
@@ -513,7 +529,7 @@ def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch
     amplitude, before, mean, gain, variance, clipped, offset, verdict = columns
     used = []
 
-    def measure(self, seen, lacking, offset):
+    def measure(self, seen, noise, lacking, offset):
         used.append((np.asarray(lacking), np.asarray(offset)))
         wide = jnp.asarray(gain[:, None] * np.exp(1j * np.arange(3))[None, :])
         return wide, jnp.ones((len(rows), 3))
@@ -525,7 +541,8 @@ def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch
     sums = np.stack([*np.zeros((6, len(rows))), mean, zero, zero], axis=1)
     seen = Seen(sums, variance, clipped, (verdict == "repeated") | (verdict == "flat"))
     state = state_of(amplitude=before, offset=offset).electrodes
-    found = tick.measured_pulse(bands, seen, jnp.asarray(amplitude), state)
+    noise = Noise.of(jnp.ones(3), 0, 1.0, len(rows))
+    found = tick.measured_pulse(bands, seen, jnp.asarray(amplitude), state, noise)
     relative = np.where(amplitude > 0, amplitude, 1.0)
     lacking = np.where(np.isnan(before), 0.0, (relative - before) / relative)
     steady = abs(lacking) < tick.STEADY
@@ -550,13 +567,15 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(monkeypatch):
     monkeypatch.setattr(tick, "searched", lambda *_: jnp.zeros(3))
     for name in ("departure", "undelayed", "expected"):
         monkeypatch.setattr(GainModel, name, lambda *_: wave)
-    measured, model = MEASURED(wave, zero, jnp.ones(3), *[zero] * 6), object.__new__(GainModel)
+    monkeypatch.setattr(GainModel, "patterns", lambda *_: jnp.zeros((0, 6)))
+    parts = jnp.ones(3), jnp.zeros(0)
+    measured, model = MEASURED(wave, zero, *parts, *[zero] * 6), object.__new__(GainModel)
     scores = PulseScores(jnp.zeros((2, 3)), two)
 
     @jax.jit
     @jax.vmap
     def alone(spread, result):
-        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, scores)
+        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, scores, zero, zero)
         monkeypatch.setattr(tick, "attempt", lambda *_: fit)
         return anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two).result
 

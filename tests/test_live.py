@@ -56,15 +56,21 @@ SKINS = {**LOADS, "open": ResistorLoad(1e9), "short": ResistorLoad(1.0)}
 
 
 def alone():
-    """A pulse alone behind each load, and the period after it: (load, 2, sample) [V]."""
+    """A pulse alone behind each load, and the period after it: (load, phase, 2, sample) [V].
+
+    A window begins at a sample, of three pulses one at a whole number of samples.
+    """
     of = scene(1)
     sampler = Sampler(RATE, PULSES / 2, of.antialias * RATE)
     v_th, z_th = of.driver.v_th_spectrum(sampler.f) * PULSES / 2, of.driver.z_th(sampler.f)
     return {
-        name: np.stack(
+        name: np.array(
             [
-                sampler.sample(v_th * loading(load(sampler.f), z_th), 3333, start)
-                for start in (0.0, 1 / PULSES)
+                [
+                    sampler.sample(v_th * loading(load(sampler.f), z_th), 3333, start + late)
+                    for start in (0.0, 1 / PULSES)
+                ]
+                for late in (round(n * PERIOD) / RATE - n / PULSES for n in range(3))
             ]
         )
         for name, load in SKINS.items()
@@ -109,7 +115,7 @@ class Display:
                         line.sendall(self.raw)
                         self.silent = True
                         continue
-                    of = np.stack([pulses[name] for name in self.skin])
+                    of = np.stack([pulses[name][self.number % 3] for name in self.skin])
                     v = now[:, None] * of[:, 0] + before[:, None] * of[:, 1]
                     v += NOISE * noise.standard_normal(v.shape)
                     begin = round(self.number * PERIOD)

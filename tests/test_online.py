@@ -196,6 +196,7 @@ def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
     known = known_at(tracker.model.bands.frequency, driver, False, MAXIMUM_LIKELIHOOD)
     pulses = clean[:6]
     state = followed(tracker, with_noise(pulses, seed=4))
+    state = dataclasses.replace(state, noise=tracker.start().noise)  # of the same weights
     step = 1e-3  # of a standard deviation of Z_th
 
     def logarithms(z):

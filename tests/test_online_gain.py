@@ -147,7 +147,8 @@ def test_the_score_is_that_of_the_gain_and_its_error_that_of_the_driver():
 
     by_source = np.stack([shifted(step * error) for error in tracker.model.source_error])
     expected = np.sqrt((by_source**2).sum(axis=0))
-    without = dataclasses.replace(tracker.model.bands, variance_x=jnp.zeros(()))
+    bands = tracker.model.bands
+    without = dataclasses.replace(bands, variance_x=0 * bands.variance_x)
     of_source = of_gain(with_model(bands=without), pulses)[2]
     np.testing.assert_allclose(of_source, expected, rtol=0.05)
     assert (common > of_source).all()  # by the noise of the unloaded record

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from etid.online import stream
+from etid.online.clock import Clock
 from tests.test_online import DRY, calibrated, loaded, scene
 
 PATH = pathlib.Path(__file__).parents[1] / "examples" / "stream_display.py"
@@ -26,7 +27,7 @@ def blocks(v, size, without=()):
 @pytest.mark.parametrize("size", [7, 33, 34, 100, 1000])
 def test_windows_do_not_depend_on_the_blocks(size):
     v = np.arange(2 * 1000.0).reshape(2, 1000)
-    pulses = stream.Pulses(33.4, 33, 2)
+    pulses = stream.Pulses(Clock(33.4, np.zeros(33)), 2)
     found = [(number, window.copy()) for number, window in pulses.cut(blocks(v, size))]
     assert [number for number, _ in found] == list(range(29 + (round(29 * 33.4) + 33 <= 1000)))
     for number, window in found:
@@ -37,7 +38,7 @@ def test_windows_do_not_depend_on_the_blocks(size):
 
 def test_missing_and_late_blocks_are_counted_and_only_their_pulses_suffer():
     v = np.ones((2, 1000))
-    pulses = stream.Pulses(33.4, 33, 2)
+    pulses = stream.Pulses(Clock(33.4, np.zeros(33)), 2)
     kept = list(blocks(v, 50, without=(4,)))
     late = [*kept[:8], (200, v[:, 200:250]), *kept[8:]]
     bad = [number for number, w in pulses.cut(late) if np.isnan(w).any()]
@@ -49,7 +50,7 @@ def test_missing_and_late_blocks_are_counted_and_only_their_pulses_suffer():
 
 def test_a_counter_that_begins_anew_begins_new_windows():
     v = np.arange(2 * 2000.0).reshape(2, 2000)
-    pulses, size = stream.Pulses(33.4, 33, 2), 50
+    pulses, size = stream.Pulses(Clock(33.4, np.zeros(33)), 2), 50
     again = [*blocks(v, size), *blocks(v[:, :500], size)]
     found = list(pulses.cut(again))
     numbers = [number for number, _ in found]
@@ -62,7 +63,7 @@ def test_a_counter_that_begins_anew_begins_new_windows():
 
 def test_a_block_that_is_late_by_less_than_a_pause_is_no_new_beginning():
     v = np.arange(2 * 2000.0).reshape(2, 2000)
-    pulses, known = stream.Pulses(33.4, 33, 2), list(blocks(v, 50))
+    pulses, known = stream.Pulses(Clock(33.4, np.zeros(33)), 2), list(blocks(v, 50))
     late = [*known[:30], known[30 - stream.PAUSE // 2], *known[30:]]
     assert [number for number, _ in pulses.cut(late)] == list(range(59))
     assert (pulses.late, pulses.missing) == (1, 0)
@@ -127,7 +128,7 @@ def test_a_file_is_played_to_its_end_and_logged(example, tmp_path, capsys):
 
 
 def test_a_long_pause_is_counted_and_not_given_pulse_by_pulse():
-    pulses = stream.Pulses(10.0, 10, 2)
+    pulses = stream.Pulses(Clock(10.0, np.zeros(10)), 2)
     blocks = [(0, np.ones((2, 10))), (10**12, np.ones((2, 10)))]
     found = [(number, np.isnan(window).all()) for number, window in pulses.cut(blocks)]
     assert found == [(0, False), (10**11 - 1, True), (10**11, False)]

@@ -66,7 +66,7 @@ def follow(
         ValueError: A block has another number of electrodes.
     """
     tracker = controller.tracker
-    pulses = Pulses(tracker.period, tracker.model.bands.samples, tracker.electrodes)
+    pulses = Pulses(tracker.clock(), tracker.electrodes)
     at_rest, given = stimulator is not None, np.ones(tracker.electrodes)
     state = tracker.start(at_rest=at_rest)
     # It compiles here, while nothing waits.

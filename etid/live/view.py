@@ -280,14 +280,9 @@ class LiveView:
         if not np.asarray(before.pulses)[at]:
             return np.full(self._snapshot["predicted"].shape[-1], np.nan)
         bands = self._controller.tracker.model.bands
-        x, own = np.asarray(bands.x), np.asarray(state.own)[at]
         gain = self._gain(np.asarray(before.own)[at])
-        turn = np.arange(1, x.size + 1) / bands.samples  # per sample
-        centres = np.asarray(bands.frequency) / bands.sample_rate
-        by_bin = np.interp(turn, centres, gain)
-        spectrum = np.zeros(bands.samples // 2 + 1, complex)
-        spectrum[1 : x.size + 1] = x * by_bin * np.exp(-2j * np.pi * turn * own[-1])
-        pulse = np.fft.irfft(np.asarray(state.amplitude)[at] * spectrum, bands.samples)
+        pulse = bands.waveform(gain, float(np.asarray(state.own)[at, -1]))
+        pulse = np.asarray(state.amplitude)[at] * pulse
         return pulse[self._part] + tick.window[at].mean()
 
     @in_float64

@@ -69,8 +69,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from etid.estimators.score_tests.other_circuit import MOVED, NOTHING, SPREAD, Score
 from etid.online.pulse_fit import Expected, Pulse
-from etid.signals.harmonics import real_parts
-from etid.signals.transfer import as_complex, power
 from etid.solvers.matrices import inverse_of_few
 
 FALSE_ALARMS = 0.05  # per electrode and hour, expected if T and Q have exactly their distributions
@@ -182,7 +180,6 @@ class PulseScores(NamedTuple):
     def of(
         cls,
         pulse: Pulse,
-        variance: Float[Array, ""],
         expected: Expected,
         residual: Float[Array, " part"],
         inverse: Float[Array, "own own"],
@@ -191,14 +188,13 @@ class PulseScores(NamedTuple):
 
         Args:
             pulse: The objective.
-            variance: E|noise|² of a Fourier coefficient of V_out [V²].
             expected: Gain near the minimum.
-            residual: Residual at the minimum, but for a step along the elements and the delay.
+            residual: Residual at the minimum.
             inverse: (J Jᵀ)⁻¹.
         """
-        gain, model, weight = expected.gain, pulse.model, as_complex(jnp.sqrt(pulse.weight))
+        gain = expected.gain
         jacobian = pulse.jacobian(expected)
-        along = real_parts(jnp.stack([gain, expected.spread]) * weight[None, :])
+        along = pulse.whitened(jnp.stack([gain, expected.spread]))
         others = along @ jacobian.T @ inverse
         d = along - others @ jacobian
         score, information = d @ residual, jnp.sum(d**2, axis=1)
@@ -206,9 +202,8 @@ class PulseScores(NamedTuple):
         freedom = 2 * jnp.sum(pulse.weight > 0, dtype=score.dtype) - others.shape[1] - 1
         explained = score**2 / jnp.where(tested, information, 1.0)
         chi2 = (residual @ residual - explained) / freedom
-        of_source = real_parts(model.by_error(gain) * weight[None, :]) @ d.T
-        of_x = power(gain) * model.bands.variance_x / variance
-        common = jnp.sqrt(jnp.sum(of_source**2, axis=0) + d**2 @ jnp.tile(of_x, 2))
+        of_source = pulse.errors_along(gain, d)
+        common = jnp.sqrt(jnp.sum(of_source**2, axis=1) + d**2 @ pulse.by_x(gain))
         # More noise than stated lessens the weight of a pulse, as it does in a fit of a record.
         sums = jnp.stack([score, information, common], axis=1) / jnp.maximum(chi2, 1.0)[:, None]
         return cls(jnp.where(tested[:, None], sums, 0.0), -others[0, :-1])

@@ -34,11 +34,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.online.projection import Projection, Seen
 from etid.precision import Module
 from etid.signals.harmonics import ALIASED
+from etid.signals.mains import MAINS, MULTIPLES
 from etid.signals.noise import RIPPLE
 from etid.signals.transfer import as_complex, power
 
@@ -47,6 +48,9 @@ WIDEST = 64  # [bins] largest width of a band
 LAST_BAND = 8  # [bins] width of the last band, which has no neighbour to show its curvature
 TAIL_SPREAD = 0.2  # of the rate of the tail, by the load, relative to that of the unloaded record
 LAST = 1 / 26  # fraction of a period at its end whose mean is the tail
+LOCKED = 0.03  # [harmonics] distance from a harmonic up to which the mains is locked to the pulses
+FREE = 5  # windows of the unloaded record, beyond its unknowns, that must show its noise
+ALIKE = 3  # bands on either side of a band that have nearly its noise
 
 
 def cut(
@@ -82,7 +86,11 @@ class Bands(Module):
 
     Attributes:
         x: Fourier coefficients of the unloaded pulse, not normalised, from bin 1 on [V].
-        variance_x: E|noise|² of a coefficient in `x` [V²].
+        variance_x: E|noise|² of a coefficient in `x`, in each band [V²].
+        noise: Variance of the noise in each band of the unloaded record, relative to that in the
+            quiet between two pulses.
+        hum: Bands in which hum of the mains may be locked to the pulses.
+        lines: Cosine and sine of each line of the mains between the harmonics, as gains [1/V].
         frequency: Centre of each band [Hz].
         weight: Weight of |Ĝ − G|² before division by the variance of V_out [V²].
         bent: Coefficients of a function's values in the band before, the band itself and the next
@@ -102,7 +110,10 @@ class Bands(Module):
     """
 
     x: Complex[Array, " bin"]
-    variance_x: Float[Array, ""]
+    variance_x: Float[Array, " band"]
+    noise: Float[Array, " band"]
+    hum: Bool[Array, " band"]
+    lines: Complex[Array, "pattern band"]
     frequency: Float[Array, " band"]
     weight: Float[Array, " band"]
     bent: Float[Array, "3 band"]
@@ -114,10 +125,21 @@ class Bands(Module):
     sample_rate: float = eqx.field(static=True)
     samples: int = eqx.field(static=True)
 
-    def waveform(self) -> Float[np.ndarray, " sample"]:
-        """The unloaded pulse in the band of `x` [V]."""
+    def waveform(
+        self, gain: Complex[np.ndarray, " band"] | None = None, delay: float = 0.0
+    ) -> Float[np.ndarray, " sample"]:
+        """The pulse in the band of `x` [V].
+
+        Args:
+            gain: Gain in each band; the unloaded pulse without it.
+            delay: Delay [samples].
+        """
         spectrum = np.zeros(self.samples // 2 + 1, complex)
-        spectrum[1 : self.x.size + 1] = self.x
+        turn = np.arange(1, self.x.size + 1) / self.samples  # per sample
+        spectrum[1 : self.x.size + 1] = self.x * np.exp(-2j * np.pi * turn * delay)
+        if gain is not None:
+            centres = np.asarray(self.frequency) / self.sample_rate
+            spectrum[1 : self.x.size + 1] *= np.interp(turn, centres, gain)
         return np.fft.irfft(spectrum, self.samples)
 
     def departure(
@@ -138,12 +160,17 @@ class Bands(Module):
         return jnp.sum(factor * values, axis=0) - as_complex(0.5 * delay**2 * self.spread) * gain
 
     def measure(
-        self, seen: Seen, lacking: Float[Array, " lane"], offset: Float[Array, " lane"]
+        self,
+        seen: Seen,
+        noise: Float[Array, "lane band"],
+        lacking: Float[Array, " lane"],
+        offset: Float[Array, " lane"],
     ) -> tuple[Complex[Array, "lane band"], Float[Array, "lane band"]]:
         """Gains of one pulse at all electrodes, as if its amplitude had been constant.
 
         Args:
             seen: The bands of the windows.
+            noise: Variance of the noise in each band, relative to that of the quiet.
             lacking: (A − B) / A, for a pulse of amplitude A after one of amplitude B.
             offset: Offset of the converter [V].
 
@@ -153,7 +180,7 @@ class Bands(Module):
         gain = seen.gain()
         tail = self._lacking_tail(seen, lacking, offset)
         unsure = self.weight[None, :] * power(0.2 * tail) / 2  # a fifth of the tail
-        weight = self.weight[None, :] / (seen.variance[:, None] + unsure)
+        weight = self.weight[None, :] / (seen.variance[:, None] * noise + unsure)
         return gain + tail, weight
 
     def _lacking_tail(
@@ -209,6 +236,16 @@ def _tail_rate(v: Float[np.ndarray, " sample"]) -> float:
     return math.log(ratio) / (v.size - last - middle) if ratio > 1 else 0.0
 
 
+def _smoothed(
+    values: Float[np.ndarray, " band"], hum: Bool[np.ndarray, " band"]
+) -> Float[np.ndarray, " band"]:
+    """Geometric means of neighbouring bands; where hum may be, that of the first ones above it."""
+    first = min(int(hum.sum()), values.size - 1)
+    ends = [slice(max(at - ALIKE, first), at + ALIKE + 1) for at in range(values.size)]
+    logs = np.log(values)
+    return np.exp([logs[ends[max(at, first)]].mean() for at in range(values.size)])
+
+
 def unloaded_bands(
     v_th: Float[np.ndarray, " time"],
     sigma_th: float,
@@ -246,7 +283,7 @@ def unloaded_bands(
     wide = np.diff(edges)
 
     def summed(values: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(values, edges[:-1] - 1)
+        return np.add.reduceat(values, edges[:-1] - 1, axis=-1)
 
     strength = summed(np.abs(x) ** 2)
     centre = summed(np.abs(x) ** 2 * number) / strength
@@ -283,10 +320,24 @@ def unloaded_bands(
     tail = np.exp(-later) if rate > 0 else np.zeros(size)
     tails = np.stack([tail, -later * tail])
     spread = width / strength * (2 * np.pi / size) ** 2
+    hum = centre * sample_rate / size < (MULTIPLES + 0.5) * max(MAINS)
+    level, by_band = size * sigma_th**2, np.ones(len(wide))
+    if len(windows) - len(found) >= FREE:
+        level = float(whole.seen(windows, np.array([-np.inf, np.inf])).variance.mean())
+        rest = summed((y - design @ found) * x.conj())
+        squares = np.sum(np.abs(rest) ** 2, axis=0) / (len(windows) - len(found))
+        by_band = _smoothed(np.maximum(squares / strength, whole.floor) / level, hum)
+    time, cycles = np.arange(size) / sample_rate, [f * size / sample_rate for f in MAINS]
+    between = [f for f, n in zip(MAINS, cycles, strict=True) if abs(n - round(n)) > LOCKED]
+    waves = [wave(2 * np.pi * f * time) for f in between for wave in (np.cos, np.sin)]
+    lines = np.reshape(waves, (len(waves), size)) @ rows.T
     first, second = _slopes(angle)
     bands = Bands(
         x=jnp.asarray(x),
-        variance_x=jnp.asarray(variance),
+        variance_x=jnp.asarray(share * level * by_band),
+        noise=jnp.asarray(by_band),
+        hum=jnp.asarray(hum),
+        lines=jnp.asarray(lines),
         frequency=jnp.asarray(centre * sample_rate / size),
         weight=jnp.asarray(np.where(present, 2 * size / noise, 0.0)),
         bent=jnp.asarray(0.5 * spread * second),

@@ -22,6 +22,7 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_bands import Bands
+from etid.online.noise import cleared
 from etid.precision import Module
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, combined, frequency_variable, power, reciprocal
@@ -103,16 +104,29 @@ class GainModel(Module):
         faults = None if known.faults is None else independent @ known.faults[1]
         return cls(circuit, bands, source, source_alias, turn, turns, freedom, error, faults)
 
+    def errors_along(
+        self, gain: Complex[Array, " band"], weights: Complex[Array, "value band"]
+    ) -> Float[Array, "value z"]:
+        """Re Σ conj(w) `by_error`; all electrodes have the same errors, one matrix product."""
+        by_source = real_parts(jnp.conj(gain * (gain - 1))[None, :] * weights)
+        found = by_source @ real_parts(self.source_error).T
+        if self.faults is None:
+            return found
+        by_fault = real_parts(self._by_fault(gain))
+        return found + real_parts(weights) @ by_fault.T @ self.faults.T
+
     def by_error(self, gain: Complex[Array, " band"]) -> Complex[Array, "z band"]:
         """Changes of a gain by each independent error of calibrations and instrument."""
         # ∂G/∂ log Z_th = −G (1 − G)
         found = (gain * (gain - 1))[None, :] * self.source_error
         if self.faults is None:
             return found
+        return found + combined(self.faults, self._by_fault(gain))
+
+    def _by_fault(self, gain: Complex[Array, " band"]) -> Complex[Array, "3 band"]:
         # ∂G/∂C = −s Z_L² ∂G/∂Z_L
         by_capacitance = -frequency_variable(self.bands.frequency) * self.source * gain**2
-        by_fault = jnp.stack([gain, jnp.ones_like(gain), by_capacitance])
-        return found + combined(self.faults, by_fault)
+        return jnp.stack([gain, jnp.ones_like(gain), by_capacitance])
 
     def expected(self, logs: Float[Array, " element"]) -> "Expected":
         """The gain of a load, and its derivatives."""
@@ -139,6 +153,22 @@ class GainModel(Module):
         cosine = 1 - square / 2 * (1 - square / 12 * (1 - square / 30))
         sine = angle * (1 - square / 6 * (1 - square / 20 * (1 - square / 42)))
         return self.turns[near] * jax.lax.complex(cosine, sine)
+
+    def patterns(
+        self,
+        delay: Float[Array, ""],
+        weight: Float[Array, " band"],
+        line: Float[Array, " line"],
+    ) -> Float[Array, "pattern part"]:
+        """Lines of the mains in the residual of a delayed pulse [standard deviations].
+
+        Args:
+            delay: Delay [samples].
+            weight: Weight of |Ĝ − G|² in each band.
+            line: Deviation of each line, for a pulse of the amplitude of the unloaded record [V].
+        """
+        turned = self.turned(delay) * as_complex(jnp.sqrt(weight))
+        return real_parts(self.bands.lines * turned[None, :]) * jnp.repeat(line, 2)[:, None]
 
     def undelayed(self, logs: Float[Array, " element"]) -> Complex[Array, " band"]:
         """The gain without a delay."""
@@ -215,7 +245,7 @@ def minimum(
 
     Returns:
         The parameters after these steps, the last normal equations that were accepted, the
-        reduction of Σ r² that these predict, and the residual of these equations.
+        reduction of Σ r² that these predict, and the residual at the minimum.
     """
     own = start.vector()
     jacobian = pulse.jacobian(expected)
@@ -237,8 +267,8 @@ def minimum(
     )
     step = inverse @ at.gradient
     decrement = jnp.dot(step, at.gradient)
-    own = jnp.where(decrement < SETTLED**2, own - step, own)
-    return own, at, decrement, jnp.where(better, residual, first)
+    step = jnp.where(decrement < SETTLED**2, step, 0.0)
+    return own - step, at, decrement, jnp.where(better, residual, first) - step @ jacobian
 
 
 def searched(
@@ -288,6 +318,7 @@ class Pulse(Module):
         weight: Weight of |Ĝ − G|² in each band.
         centre: Logarithms of the elements before the pulse [SI].
         information: Inverse covariance of `centre`.
+        lines: Lines of the mains of which the residual is cleared (`etid.online.noise`).
     """
 
     model: GainModel
@@ -295,6 +326,26 @@ class Pulse(Module):
     weight: Float[Array, " band"]
     centre: Float[Array, " element"]
     information: Float[Array, "element element"]
+    lines: Float[Array, "pattern part"]
+
+    def whitened(self, gains: Complex[Array, "*value band"]) -> Float[Array, "*value part"]:
+        """Gains in standard deviations of the noise."""
+        root = jnp.broadcast_to(as_complex(jnp.sqrt(self.weight)), gains.shape)
+        return cleared(real_parts(gains * root), self.lines)
+
+    def errors_along(
+        self, gain: Complex[Array, " band"], directions: Float[Array, "value part"]
+    ) -> Float[Array, "value z"]:
+        """Components of the independent errors of the gain along directions of the residual."""
+        parts = jnp.split(cleared(directions, self.lines[::-1]), 2, axis=1)
+        weights = jax.lax.complex(*parts) * as_complex(jnp.sqrt(self.weight))[None, :]
+        return self.model.errors_along(gain, weights)
+
+    def by_x(self, gain: Complex[Array, " band"]) -> Float[Array, " part"]:
+        """Variance of the residual by the noise of the unloaded record."""
+        of = self.model.bands
+        each = self.weight / jnp.where(of.weight > 0, of.weight, 1.0)
+        return jnp.tile(power(gain) * of.variance_x * each, 2)
 
     def jacobian(self, expected: Expected) -> Float[Array, "own part"]:
         """Derivatives of the residual with respect to the elements and the delay."""
@@ -303,14 +354,13 @@ class Pulse(Module):
         # otherwise the noise of Ĝ would count as information.
         by_delay = expected.gain * jax.lax.complex(jnp.zeros_like(turn), turn)
         rows = jnp.concatenate([-expected.slope, by_delay[None, :]])
-        return real_parts(rows * as_complex(jnp.sqrt(self.weight))[None, :])
+        return self.whitened(rows)
 
     def residual(
         self, expected: Complex[Array, " band"], delay: Float[Array, ""]
     ) -> Float[Array, " part"]:
         """Measured minus expected gain [standard deviations], for a delay [samples]."""
-        weight = as_complex(jnp.sqrt(self.weight))
-        return real_parts((self.gain * self.model.turned(delay) - expected) * weight)
+        return self.whitened(self.gain * self.model.turned(delay) - expected)
 
     def prior(self, own: LoadUnknowns) -> tuple[Float[Array, " own"], Float[Array, ""]]:
         """Squared distance from what is known before the pulse: half its gradient, and itself."""

@@ -16,14 +16,13 @@ from etid.estimators.registry import register_description
 from etid.estimators.score_tests.other_circuit import MOVED, SPREAD
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.alarms import SEEN_IN_PULSES, score_of
+from etid.online.noise import Noise, directions
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
 from etid.online.repeats import Windows
 from etid.precision import Module
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, counted, first_verdict, verdict_names
-from etid.signals.harmonics import real_parts
-from etid.signals.transfer import as_complex, power
 from etid.solvers.matrices import inverse
 
 METHOD = "online"
@@ -128,6 +127,7 @@ class TrackerState(Overviewed, Module):
 
     Attributes:
         electrodes: Estimates of all electrodes.
+        noise: What their pulses have shown of the noise.
         number: Number of pulses since the start of the stream.
         driver_event: Whether the last pulse showed a change of the driver.
         driver_changed: Whether any pulse since the start did.
@@ -135,6 +135,7 @@ class TrackerState(Overviewed, Module):
     """
 
     electrodes: ElectrodeState
+    noise: Noise
     number: Int[Array, ""]
     driver_event: Bool[Array, ""]
     driver_changed: Bool[Array, ""]
@@ -163,7 +164,11 @@ class TrackerState(Overviewed, Module):
 
 
 def fit_of(
-    model: GainModel, driver_result: RESULTS, driver_changed: Bool[Array, ""], state: ElectrodeState
+    model: GainModel,
+    driver_result: RESULTS,
+    driver_changed: Bool[Array, ""],
+    state: ElectrodeState,
+    noise: Noise,
 ) -> Fit:
     """The fit of one electrode."""
     bands = model.bands
@@ -171,16 +176,15 @@ def fit_of(
     elements = logs.size
     expected = model.expected(logs)
     nothing = jnp.zeros((elements, elements))
-    weight = bands.weight / state.variance
-    pulse = Pulse(model, jnp.zeros_like(expected.gain), weight, logs, nothing)
+    weight = bands.weight / state.variance / noise.bands
+    lines = directions(model.patterns(jnp.zeros(()), weight, noise.line))
+    pulse = Pulse(model, jnp.zeros_like(expected.gain), weight, logs, nothing, lines)
     jacobian = pulse.jacobian(expected)
     by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
-    roots = as_complex(jnp.sqrt(weight))
-    by_error = roots[None, :] * model.by_error(expected.gain)
-    of_source = by_term @ real_parts(by_error).T
+    of_source = by_term @ pulse.whitened(model.by_error(expected.gain)).T
     # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
-    of_x = jnp.tile(power(expected.gain) * bands.variance_x / state.variance, 2)
-    slope = -by_term @ real_parts(roots * expected.gain)
+    of_x = pulse.by_x(expected.gain)
+    slope = -by_term @ pulse.whitened(expected.gain)
     likely, doubt = score_of(state.scores[0], slope).doubt()
     shared = of_source @ of_source.T + (by_term * of_x[None, :]) @ by_term.T + doubt
     cov = inverse(state.information) + shared

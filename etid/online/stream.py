@@ -6,6 +6,7 @@ of samples that goes back by `PAUSE` periods or more has begun anew: so do the w
 """
 
 import dataclasses
+import math
 import os
 import socket
 import time
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.display import several
+from etid.online.clock import Clock
 from etid.recordings.errors import RecordingError
 from etid.recordings.untrusted import guarded
 
@@ -145,27 +147,19 @@ class Pulses:
     """Cuts windows of one pulse from blocks.
 
     Attributes:
-        period: Length of a period [samples].
-        samples: Length of a window [samples].
+        clock: When the pulses come.
         electrodes: Number of electrodes.
-        number: Number of the pulse that is being filled.
         late: Blocks that came after their pulse was over.
         missing: Pulses without all of their samples.
     """
 
-    period: float
-    samples: int
+    clock: Clock
     electrodes: int
-    number: int = 0
     late: int = 0
     missing: int = 0
 
     def __post_init__(self) -> None:
-        self.window = np.full((self.electrodes, self.samples), np.nan)
-
-    def begin(self, number: int) -> int:
-        """First sample of a pulse: the nearest to the start of its period."""
-        return round(number * self.period)
+        self.window = np.full((self.electrodes, self.clock.samples), np.nan)
 
     def cut(
         self, blocks: Iterable[Block]
@@ -177,33 +171,37 @@ class Pulses:
         Raises:
             ValueError: A block has another number of electrodes.
         """
+        clock = self.clock
         for first, block in blocks:
             if block.shape[0] != self.electrodes:
                 raise ValueError(
                     f"a block has {several(block.shape[0], 'electrode')}, not {self.electrodes}"
                 )
-            behind = self.begin(self.number) - first - block.shape[1]
-            if behind >= PAUSE * self.period:
-                self.number = int(first / self.period)
+            behind = clock.begin - first - block.shape[1]
+            if behind >= PAUSE * clock.period:
+                clock.restart(int(first / clock.period))
                 self.window = np.full_like(self.window, np.nan)
             elif behind >= 0:
                 self.late += 1
                 continue
-            lost = int(first / self.period) - self.number - 1
+            lost = math.floor((first - clock.place) / clock.period) - 1
             if lost > 60:  # a long pause, whose pulses the tracker does not get one by one
                 self.missing += lost
-                self.number += lost
+                clock.skip(lost)
                 self.window = np.full_like(self.window, np.nan)
             while True:
-                begin = self.begin(self.number)
-                low, high = max(first, begin), min(first + block.shape[1], begin + self.samples)
+                begin, end = clock.begin, clock.begin + clock.samples
+                low, high = max(first, begin), min(first + block.shape[1], end)
                 if low < high:
                     self.window[:, low - begin : high - begin] = block[
                         :, low - first : high - first
                     ]
-                if first + block.shape[1] < begin + self.samples:
+                if first + block.shape[1] < end:
                     break
                 self.missing += bool(np.isnan(self.window).any())
-                yield self.number, self.window
-                self.number += 1
-                self.window = np.full_like(self.window, np.nan)
+                yield clock.number, self.window
+                clock.follow(self.window)
+                # A window may begin before the end of the last one, which has these samples.
+                last, self.window = self.window, np.full_like(self.window, np.nan)
+                if (shared := end - clock.begin) > 0:
+                    self.window[:, :shared] = last[:, -shared:]

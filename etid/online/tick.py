@@ -4,6 +4,7 @@ For each electrode a tick has the verdict on the samples, the fit with the predi
 a change, a fit of the pulse alone where it is new or suspected, and the state after it.
 """
 
+import dataclasses
 from functools import partial
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from etid.estimators.starts import circuit_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.alarms import Innovation, PulseScores, averaged, driver_change
 from etid.online.gain_bands import Bands
+from etid.online.noise import Noise, cleared, directions
 from etid.online.projection import Seen
 from etid.online.pulse_fit import (
     DELAYS,
@@ -44,6 +46,7 @@ class Measured(NamedTuple):
         gain: Measured gain.
         variance: E|noise|² of a Fourier coefficient of V_out [V²].
         weight: Weight of |Ĝ − G|² in each band.
+        line: Deviation of each line of the mains, for a pulse of amplitude 1 [V].
         level: Effective value of the gain.
         amplitude: Amplitude of the pulse, relative to that of the unloaded record.
         offset: Offset of the converter [V].
@@ -55,6 +58,7 @@ class Measured(NamedTuple):
     gain: Complex[Array, "*lane band"]
     variance: Float[Array, "*lane"]
     weight: Float[Array, "*lane band"]
+    line: Float[Array, "*lane line"]
     level: Float[Array, "*lane"]
     amplitude: Float[Array, "*lane"]
     offset: Float[Array, "*lane"]
@@ -74,6 +78,8 @@ class Attempt(NamedTuple):
         rrse: RRSE of the pulse.
         result: Verdict.
         scores: Scores of a gain and of a spread.
+        residual: Residual of the pulse, of variance 1 if the noise is as expected.
+        lines: Lines of the mains, as the residual.
     """
 
     own: Float[Array, "*lane own"]
@@ -83,6 +89,8 @@ class Attempt(NamedTuple):
     rrse: Float[Array, "*lane"]
     result: RESULTS
     scores: PulseScores
+    residual: Float[Array, "*lane part"]
+    lines: Float[Array, "*lane pattern part"]
 
 
 class Suspicion(NamedTuple):
@@ -113,11 +121,12 @@ def updated(
     change: Float[Array, ""],
     limit: Float[Array, ""],
     before: ElectrodeState,
+    noise: Noise,
     number: Int[Array, ""],
     driver_changed: Bool[Array, ""],
     seen: Seen,
     amplitude: Float[Array, " lane"],
-) -> tuple[ElectrodeState, Int[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+) -> tuple[ElectrodeState, Noise, Int[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
     """The fields of `TrackerState` after one more pulse, without its windows.
 
     Args:
@@ -125,6 +134,7 @@ def updated(
         change: Standard deviation of the random walk [1/√pulse].
         limit: Limit of the tests for a change.
         before: Estimates before the pulse.
+        noise: Noise before the pulse.
         number: Number of the pulse before.
         driver_changed: Whether any pulse before showed a change of the driver.
         seen: What the windows show.
@@ -132,7 +142,7 @@ def updated(
     """
     number = number + 1
     powers = model.circuit.scaling()[0]  # also how a change of Z_th moves the elements
-    measured = measured_pulse(model.bands, seen, amplitude, before)
+    measured = measured_pulse(model.bands, seen, amplitude, before, noise)
     information = jax.vmap(lambda of: predicted(of, change))(before.information)
     logs = LoadUnknowns.of(before.own).log_elements
     expected = _expected(model, logs, number)
@@ -147,8 +157,30 @@ def updated(
         return attempt(model, measured, LoadUnknowns(logs, delay), expected, logs, information)
 
     found = jax.vmap(tracked)(logs, measured, expected, information)
-    suspected = jax.vmap(partial(suspicion, common=powers, limit=limit))(before, found, information)
     running = before.pulses > 0
+
+    suspect = jax.vmap(partial(suspicion, common=powers, limit=limit))
+
+    # Hum that begins now is a misfit until it is known, and would be a change of the driver. With
+    # the hum that it shows, the pulse must fit its prediction.
+    def heard(noise: Noise) -> tuple[Measured, Attempt, Noise]:
+        known = jax.vmap(partial(noise_after, model.bands.hum))(noise, measured, found)
+        other = measured_pulse(model.bands, seen, amplitude, before, known)
+        fit = jax.vmap(tracked)(logs, other, expected, information)
+        known = dataclasses.replace(known, residual=fit.residual)
+        fits = ~suspect(before, fit, information).jump
+        better = running & fits & (found.result == RESULTS.misfit)
+        return jax.vmap(lambda which, *of: jax.tree.map(partial(jnp.where, which), *of))(
+            better, (other, fit, known), (measured, found, noise)
+        )
+
+    measured, found, noise = jax.lax.cond(
+        jnp.any(running & (found.result == RESULTS.misfit)),
+        heard,
+        lambda noise: (measured, found, noise),
+        noise,
+    )
+    suspected = suspect(before, found, information)
     wanted = suspected.again & (measured.bad == SUCCESSFUL)
     starts = circuit_starts(model.circuit, None)
     fresh = jax.lax.cond(
@@ -167,7 +199,8 @@ def updated(
     )
     counts = running & measured.steady & (measured.bad == SUCCESSFUL)
     event = driver_change(suspected.jump, suspected.z.T, counts, running)
-    return after, number, event, driver_changed | event
+    noise = jax.vmap(partial(noise_after, model.bands.hum))(noise, measured, used)
+    return after, noise, number, event, driver_changed | event
 
 
 def _expected(
@@ -189,7 +222,11 @@ def _expected(
 
 
 def measured_pulse(
-    bands: Bands, seen: Seen, amplitude: Float[Array, " lane"], before: ElectrodeState
+    bands: Bands,
+    seen: Seen,
+    amplitude: Float[Array, " lane"],
+    before: ElectrodeState,
+    noise: Noise,
 ) -> Measured:
     """Gains of a pulse, and the verdict on its samples."""
     relative = jnp.where(amplitude > 0, amplitude, 1.0)
@@ -201,12 +238,13 @@ def measured_pulse(
     steady = jnp.abs(lacking) < STEADY
     offset = jnp.where(finite & steady, mean, before.offset)
     unknown = ~jnp.isfinite(offset)
-    gain, weight = bands.measure(seen, lacking, jnp.where(unknown, 0.0, offset))
+    gain, weight = bands.measure(seen, noise.bands, lacking, jnp.where(unknown, 0.0, offset))
     variance = jnp.asarray(seen.variance)
     signal = power(gain) @ bands.weight
-    noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * variance
-    flat = (signal < 4 * noise) | ~(amplitude > 0)
-    level = jnp.sqrt(jnp.maximum(signal - noise, 0.0) / jnp.sum(bands.weight)) / relative
+    power_of_noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * variance
+    flat = (signal < 4 * power_of_noise) | ~(amplitude > 0)
+    left = jnp.maximum(signal - power_of_noise, 0.0)
+    level = jnp.sqrt(left / jnp.sum(bands.weight)) / relative
     bad = jax.vmap(
         lambda finite, clipped, unknown, flat, repeated, unconnected: first_verdict(
             (~finite, RESULTS.nonfinite_samples),
@@ -221,6 +259,7 @@ def measured_pulse(
         gain=gain * as_complex(1 / relative)[:, None],
         variance=variance / relative**2,
         weight=weight * relative[:, None] ** 2,
+        line=noise.line / relative[:, None],
         level=level,
         amplitude=amplitude,
         offset=offset,
@@ -249,20 +288,22 @@ def attempt(
 ) -> Attempt:
     """The fit of a pulse from a start near its minimum."""
     gain = measured.gain - model.departure(expected, start.delay_samples)
-    pulse = Pulse(model, gain, measured.weight, centre, information)
+    patterns = model.patterns(start.delay_samples, measured.weight, measured.line)
+    lines = directions(patterns)
+    pulse = Pulse(model, gain, measured.weight, centre, information, lines)
     own, at, decrement, residual = minimum(pulse, start, expected)
-    weight = model.bands.weight
+    weight = measured.weight
     freedom = 2 * jnp.sum(weight > 0, dtype=at.squares.dtype) - own.size
     chi2 = at.squares / freedom
     # The cube root of χ² is nearly normal (Wilson and Hilferty 1931). Noise exceeds 5.2 standard
     # deviations once in 10⁷ pulses.
     width = 2 / 9 * (1 / freedom + 1 / model.noise_freedom)
     noisy = chi2 < (1 - width + 5.2 * jnp.sqrt(width)) ** 3
-    rrse = jnp.sqrt(at.squares * measured.variance / jnp.sum(weight * power(gain)))
+    rrse = jnp.sqrt(at.squares / jnp.sum(weight * power(gain)))
     by_delay = at.curvature[:-1, -1]
     told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
     inverse = inverse_of_few(at.curvature)
-    scores = PulseScores.of(pulse, measured.variance, expected, residual, inverse)
+    scores = PulseScores.of(pulse, expected, residual, inverse)
     late = jnp.abs(LoadUnknowns.of(own).delay_samples) > DELAYS[-1]
     result = first_verdict(
         (measured.bad != SUCCESSFUL, measured.bad),
@@ -270,7 +311,20 @@ def attempt(
         (~(decrement < SETTLED**2), MAX_STEPS_REACHED),
         (misses(chi2, rrse) & ~noisy | late, RESULTS.misfit),
     )
-    return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, scores)
+    # What the parameters do not take of the noise in each part.
+    jacobian = pulse.jacobian(expected)
+    left = 1 - jnp.sum((inverse_of_few(at.matrix) @ jacobian) * jacobian, axis=0)
+    return Attempt(
+        own,
+        told,
+        inverse[:-1, :-1],
+        chi2,
+        rrse,
+        result,
+        scores,
+        residual / jnp.sqrt(left),
+        cleared(patterns, lines),
+    )
 
 
 def anew(
@@ -295,6 +349,7 @@ def anew(
     # `argmin` would take a start without a number: a search that diverged would never end.
     number = jnp.argmin(jnp.where(jnp.isfinite(distances), distances, jnp.inf))
     start, delay = logs[number], delays[number]
+    lines = directions(model.patterns(delay, measured.weight, measured.line))
     nothing = jnp.zeros((starts.shape[1], starts.shape[1]))
 
     # With the departure of each step: that of a distant start moves the minimum by several standard
@@ -303,7 +358,7 @@ def anew(
         own = LoadUnknowns.of(q)
         expected = model.expected(own.log_elements)
         gain = measured.gain - model.departure(expected, own.delay_samples)
-        pulse = Pulse(model, gain, measured.weight, start, nothing)
+        pulse = Pulse(model, gain, measured.weight, start, nothing, lines)
         residual = pulse.residual(expected.gain, own.delay_samples)
         return pulse.equations(own, pulse.jacobian(expected), residual)
 
@@ -315,6 +370,15 @@ def anew(
         (found.result != SUCCESSFUL, found.result), (unknown, RESULTS.insensitive)
     )
     return found._replace(result=result)
+
+
+def noise_after(
+    hum: Bool[Array, " band"], noise: Noise, measured: Measured, used: Attempt
+) -> Noise:
+    """Noise at one electrode after one pulse."""
+    settled = (used.result == SUCCESSFUL) | (used.result == RESULTS.misfit)
+    shown = settled & measured.steady & jnp.isfinite(used.residual).all()
+    return noise.after(hum, used.residual, used.lines, shown)
 
 
 def turned(

@@ -40,6 +40,7 @@ of one or two per cent in C_p.
 """
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -57,7 +58,9 @@ from etid.identify.fitting import known_at
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.online.alarms import limit
-from etid.online.gain_bands import cut, unloaded_bands
+from etid.online.clock import Clock, measured_period
+from etid.online.gain_bands import unloaded_bands
+from etid.online.noise import Noise
 from etid.online.projection import Projection
 from etid.online.pulse_fit import GainModel
 from etid.online.repeats import Windows
@@ -106,6 +109,7 @@ class Tracker(Overviewed, Kept):
         driver_result: Verdict of the driver.
         electrodes: Number of electrodes.
         period: Length of a period [samples].
+        line: Standard error of the amplitude of a line of the mains in one pulse [V].
     """
 
     model: GainModel
@@ -116,6 +120,7 @@ class Tracker(Overviewed, Kept):
     driver_result: RESULTS
     electrodes: int
     period: float
+    line: float
 
     @classmethod
     @in_float64
@@ -166,9 +171,10 @@ class Tracker(Overviewed, Kept):
             text = f"unloaded recording {unloaded.path!r}: {name}. {explained(seen, name)}"
             raise IdentificationError(text, None)
         rate = unloaded.sample_rate
-        period = rate / seen.train.counted
+        sigma = float(seen.sigma[0])
+        period = measured_period(np.asarray(seen.v_th), sigma, rate / seen.train.counted)
         try:
-            bands, projection = unloaded_bands(seen.v_th, float(seen.sigma[0]), rate, period)
+            bands, projection = unloaded_bands(seen.v_th, sigma, rate, period)
         except ValueError as error:
             raise IdentificationError(
                 f"unloaded recording {unloaded.path!r}: {error}", None
@@ -192,6 +198,7 @@ class Tracker(Overviewed, Kept):
             driver_result=driver.result,
             electrodes=electrodes,
             period=period,
+            line=sigma * float(np.sqrt(2 / period)),
         )
 
     def _overview(self) -> Overview:
@@ -251,7 +258,9 @@ class Tracker(Overviewed, Kept):
         else:
             self.check(after)
             windows, number = after.windows, after.number
-        state = TrackerState(electrodes, number, no, no, windows)
+        bands = self.model.bands
+        noise = Noise.of(bands.noise, len(bands.lines) // 2, self.line, lanes)
+        state = TrackerState(electrodes, noise, number, no, no, windows)
         # Types and device of a state that `update` returns: with others, it would compile twice.
         state = jax.tree.map(lambda leaf: leaf.astype(leaf.dtype), state)
         return jax.device_put(state, self.model.source.sharding)
@@ -277,12 +286,25 @@ class Tracker(Overviewed, Kept):
         """Windows of one pulse each, cut from longer records.
 
         Args:
-            v_out: Loaded voltages [V]. The records begin between two pulses.
+            v_out: Loaded voltages of one display [V]. The records begin between two pulses.
 
         Returns:
-            The windows [V]. Samples after the last whole window are left out.
+            The windows [V]. Samples after the last whole window are left out. Each begins where the
+            pulses are, by the clock of the converter.
         """
-        return cut(np.asarray(unmasked(v_out)), self.period)
+        v_out = np.asarray(unmasked(v_out))
+        clock, found = self.clock(), []
+        while (end := clock.begin + clock.samples) <= v_out.shape[-1]:
+            found.append(v_out[..., clock.begin : end])
+            clock.follow(found[-1].reshape(-1, clock.samples))
+        return np.stack(found) if found else np.zeros((0, *v_out.shape[:-1], clock.samples))
+
+    @in_float64
+    def clock(self) -> Clock:
+        """A clock for the pulses of one stream."""
+        model = self.model
+        gain = np.asarray(_undelayed(model, model.circuit.log_values()))
+        return Clock(self.period, model.bands.waveform(gain))
 
     @in_float64
     def update(
@@ -329,10 +351,18 @@ class Tracker(Overviewed, Kept):
         seen = self.projection.seen(v_out.astype(float, copy=False), self.adc_range)
         seen = seen._replace(repeated=old)
         before, number, changed = state.electrodes, state.number, state.driver_changed
-        electrodes, number, event, changed = updated(
-            self.model, self.change, self.limit, before, number, changed, seen, relative
+        electrodes, noise, number, event, changed = updated(
+            self.model,
+            self.change,
+            self.limit,
+            before,
+            state.noise,
+            number,
+            changed,
+            seen,
+            relative,
         )
-        return TrackerState(electrodes, number, event, changed, state.windows)
+        return TrackerState(electrodes, noise, number, event, changed, state.windows)
 
     @in_float64
     def read(self, state: TrackerState) -> Fits:
@@ -352,7 +382,9 @@ class Tracker(Overviewed, Kept):
             RecordingError: `state` is no state of a tracker.
         """
         self.check(state)
-        found = _judged(self.model, self.driver_result, state.electrodes, state.driver_changed)
+        found = _judged(
+            self.model, self.driver_result, state.electrodes, state.driver_changed, state.noise
+        )
         fit = jax.tree.map(np.asarray, found)
         electrodes = [
             {"path": f"electrode/{number}", "electrode": str(number)}
@@ -410,8 +442,15 @@ def _judged(
     driver_result: RESULTS,
     electrodes: ElectrodeState,
     driver_changed: Bool[Array, ""],
+    noise: Noise,
 ) -> Fit:
-    return jax.vmap(lambda of: fit_of(model, driver_result, driver_changed, of))(electrodes)
+    fit = partial(fit_of, model, driver_result, driver_changed)
+    return jax.vmap(fit)(electrodes, noise)
+
+
+@jax.jit
+def _undelayed(model: GainModel, logs: Float[Array, " element"]) -> Complex[Array, " band"]:
+    return model.undelayed(logs)
 
 
 @jax.jit  # as `etid.online.tick.updated`
