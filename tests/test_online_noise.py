@@ -88,7 +88,7 @@ def test_noise_of_the_unloaded_record_is_known_by_frequency():
     record = scene(24, snr_db=None, bits=None).simulate(seed=0)["cal/0"]
     sos = scipy.signal.butter(2, 35e3, fs=RATE, output="sos")
     white = 10 * NOISE * np.random.default_rng(4).standard_normal((2, record.v_th.size + 999))
-    noise = scipy.signal.sosfilt(sos, white)[:, 999:]
+    noise = np.asarray(scipy.signal.sosfilt(sos, white))[:, 999:]
     record = record.replace(v_th=record.v_th + noise[0], v_out=record.v_out + noise[1])
     tracker = Tracker.of(driver, record, electrodes=TEN)
     bands = tracker.model.bands

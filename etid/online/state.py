@@ -62,7 +62,9 @@ register_description(
         errors="accumulate the information of all pulses; to them the error of Z_th and of the "
         "unloaded voltage was added, which no number of pulses lessens",
         noise="The variance of the noise was estimated at each pulse from the quiet between two "
-        "pulses, at six frequencies and without a parabola through each block.",
+        "pulses, at six frequencies and without a parabola through each block, and for each band "
+        "of frequency from the unloaded record and the pulses before. A line of the mains between "
+        "the harmonics was a sine of unknown amplitude and phase.",
         cited=("bell1993", "willsky1976", "lowry1992"),
     ),
 )
