@@ -15,7 +15,9 @@ import etid
 from etid.online.controller import RAISE
 from etid.results.verdicts import verdict
 from etid.simulation.transformer import SkinLoad, TransformerDriver
-from tests.test_online import DAMP, DRY, PULSES, TEN, calibrated, ten, tiled, with_noise
+from tests.skins import off
+from tests.test_live import alone
+from tests.test_online import DAMP, DRY, PULSES, TEN, TRUTH, calibrated, ten, tiled, with_noise
 
 HARMONICS = 60.0 * np.arange(1, 30_001)  # to 1.8 MHz
 POINTS = 1 << 16
@@ -227,6 +229,7 @@ NEGATIVE = [-59.5, -69.3, -16.2, -69.3, -10.3, -42.1, -16.2, -42.1, -14.9]  # va
     result=st.sampled_from(["successful", "misfit", "unstable", "unconnected"]),
     wanted=st.floats(0, 3e-6),  # what the cap of 5 mA carries in a phase
     confirmed=st.sampled_from([0.0, 1e3]),
+    step=st.sampled_from([0.0, 1 / 255]),
 )
 @example(
     own=[10.42, 12.13, -22.85, -0.06] * 2,
@@ -235,12 +238,14 @@ NEGATIVE = [-59.5, -69.3, -16.2, -69.3, -10.3, -42.1, -16.2, -42.1, -14.9]  # va
     result="successful",
     wanted=80e-9,
     confirmed=1e3,
+    step=0.0,
 )
 def test_limits_hold_whatever_the_estimate_says(
-    own, information, before, result, wanted, confirmed
+    own, information, before, result, wanted, confirmed, step
 ):
     """A not-a-number in a limit was the amplitude."""
-    controller, state = controlled(voltage_cap=30.0, slew=0.5, charge_cap=120e-9)
+    caps = {"voltage_cap": 30.0, "slew": 0.5, "charge_cap": 120e-9}
+    controller, state = controlled(amplitude_step=step, **caps)
     hostile = with_lanes(
         state,
         own=np.reshape(own, (2, 4)),
@@ -252,6 +257,42 @@ def test_limits_hold_whatever_the_estimate_says(
     command = controller.command(hostile, charge=wanted)
     most = min(float(controller.limits.guard), float(controller.limits.ceiling))
     assert (command.amplitude >= 0).all()
+    if step > 0:
+        np.testing.assert_allclose(command.amplitude / step % 1, 0.0, atol=1e-9)
     assert (command.amplitude <= np.minimum(most, tiled(np.nan_to_num(before)) + 0.5)).all()
     if confirmed == 0 or result != "successful":
         assert (command.amplitude * true_charge(SkinLoad(1e-3, 1e-3, 1e-12)) <= 120e-9).all()
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+def test_a_stimulator_of_a_few_bits_gives_what_it_is_told(bits):
+    """Told another amplitude than was given, R_p is wrong by 20 times the error, silently."""
+    step, (tracker, *_), pulses = 1 / (2**bits - 1), ten(), alone()
+    controller = etid.Controller.of(tracker, charge_cap=120e-9, amplitude_step=step)
+    state, before, seen = tracker.start(at_rest=True), np.zeros(TEN), 0
+    for number in range(25):
+        command = controller.command(state, charge=80e-9)
+        given = step * np.rint(command.amplitude / step)
+        np.testing.assert_allclose(given, command.amplitude, rtol=1e-12)
+        shapes = tiled([pulses[name][number % 3] for name in ("dry", "damp")])
+        v = given[:, None] * shapes[:, 0] + before[:, None] * shapes[:, 1]
+        state, before = tracker.update(state, with_noise(v, number), command.amplitude), given
+        good = tracker.read(state).verdicts == "successful"
+        seen += int(good.sum())
+        assert (np.abs(off(tracker.read(state), tiled(TRUTH)))[good] < 5).all()
+    assert set(command.reason) == {"wanted"}
+    assert seen > 22 * TEN
+    delivered = command.amplitude * tiled([true_charge(DRY), true_charge(DAMP)])
+    # Half a step, 0.5 % by the calibration, and the tail of the pulse before.
+    half = 0.5 * step / command.amplitude
+    assert (np.abs(delivered / 80e-9 - 1) < half + 0.005).all()
+    if bits >= 10:
+        assert (np.abs(command.charge / 80e-9 - 1) < 0.02).all()
+
+
+def test_steps_that_are_too_coarse_to_rise_are_refused():
+    tracker, *_ = ten()
+    with pytest.raises(ValueError, match=r"too coarse: .* rises from there by a quarter"):
+        etid.Controller.of(tracker, charge_cap=20e-9, amplitude_step=1 / 255)
+    with pytest.raises(ValueError, match=r"amplitude_step is -0\.1; give a step"):
+        etid.Controller.of(tracker, amplitude_step=-0.1)

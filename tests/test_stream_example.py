@@ -76,6 +76,7 @@ def test_blocks_come_through_a_socket():
         def serve():
             line, _ = server.accept()
             with line:
+                line.sendall(np.array([1023, 2, 0], "<i8").tobytes())  # 10 bits
                 for first, block in blocks(v, 100):
                     line.sendall(np.array([first, *block.shape], "<i8").tobytes())
                     line.sendall(np.ascontiguousarray(block, "<f8").tobytes())
@@ -84,8 +85,10 @@ def test_blocks_come_through_a_socket():
         thread = threading.Thread(target=serve)
         thread.start()
         with stream.connected(f"127.0.0.1:{server.getsockname()[1]}") as line:
-            found = list(stream.received(line))
+            steps = []
+            found = list(stream.received(line, stepped=steps.append))
         thread.join()
+    assert steps == [1 / 1023]
     assert [first for first, _ in found] == [0, 100, 200]
     np.testing.assert_array_equal(np.concatenate([block for _, block in found], axis=1), v)
 

@@ -63,7 +63,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
             blocks = played(arguments.file, arguments.electrodes, rate, arguments.speed)
         else:
             line = opened.enter_context(connected(arguments.socket))
-            blocks = received(line, lambda: stimulator is not None and stimulator.stopped)
+
+            def stepped(step: float) -> None:
+                if stimulator is not None:
+                    stimulator.step = step
+
+            blocks = received(line, lambda: stimulator is not None and stimulator.stopped, stepped)
         view = opened.enter_context(
             LiveView(
                 controller,

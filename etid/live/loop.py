@@ -73,11 +73,14 @@ def follow(
     first = tracker.update(state, pulses.window, given)
     controller.command(first, charge=charge)
     tracker.changes(first)
-    last, watched = -1, stimulator or view
+    last, watched, step = -1, stimulator or view, 0.0
     for number, window in pulses.cut(blocks):
         if watched is not None and watched.stopped:
             return
         begin = time.perf_counter()
+        if stimulator is not None and stimulator.step != step:
+            step = stimulator.step
+            controller = controller.stepped(step)
         if number <= last:
             state = tracker.start(at_rest=at_rest, after=state)
             if stimulator is not None:

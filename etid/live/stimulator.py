@@ -66,6 +66,7 @@ class Stimulator:
         stopped: Whether 0 was sent for good.
         pauses: How often the display had to rest since it began.
         reason: Why the display is at rest, or was the last time; empty before the first pause.
+        step: Step of the amplitudes that it can give; 0 for any, or if it has not said.
     """
 
     def __init__(
@@ -87,6 +88,7 @@ class Stimulator:
         self._numbers = set[int]()  # of the signals that are stops
         self._ended = False
         self.resting, self.stopped, self.pauses, self.reason = True, False, 0, ""
+        self.step = 0.0
         self._waking, self._woken = socket.socketpair()
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._handlers = contextlib.ExitStack()

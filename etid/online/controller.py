@@ -18,6 +18,9 @@ that the elements and Z_th predict (`etid.online.current`). The limits are appli
 | `voltage` | cap / largest unloaded voltage |
 | `slew` | amplitude before + slew |
 
+A stimulator of a few bits gives whole steps. What is wanted is rounded to the nearest step, and
+limits are rounded down.
+
 k is the quantile of the normal distribution for the stated probability; σ contains the noise of the
 pulses, the random walk of the skin until the next pulse, and the error of the calibration. A pulse
 after a pause lacks the tail of the pulse before, whose current has the other sign. A transformer
@@ -128,6 +131,7 @@ class Limits(NamedTuple):
         ceiling: Amplitude at which the unloaded voltage reaches its cap.
         slew: Largest increase of the amplitude from pulse to pulse.
         fallback: Amplitude for an electrode whose verdict is not good.
+        step: Step of the amplitudes that the stimulator can give; 0 for any amplitude.
     """
 
     current_cap: Float[Array, ""]
@@ -138,6 +142,7 @@ class Limits(NamedTuple):
     ceiling: Float[Array, ""]
     slew: Float[Array, ""]
     fallback: Float[Array, ""]
+    step: Float[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)  # as `etid.online.tracker.Tracker`
@@ -171,6 +176,7 @@ class Controller(Overviewed, Kept):
         voltage_cap: float = math.inf,
         slew: float = math.inf,
         fallback: float | None = None,
+        amplitude_step: float = 0.0,
         probability: float = 1 - 1e-9,
     ) -> "Controller":
         """A controller for the electrodes of a tracker.
@@ -187,6 +193,9 @@ class Controller(Overviewed, Kept):
                 large enough for the tracker to identify the skin, and so small that a short
                 circuit carries no more than `charge_cap`. 0.1, or the largest amplitude that
                 `charge_cap` allows if this is smaller, if it is not given.
+            amplitude_step: Step of the relative amplitudes that the stimulator can give, such as
+                1/1023 with 10 bits for 0 to 1. Only whole steps are commanded, so that the tracker
+                is told what was given. 0 if the stimulator gives any amplitude.
             probability: Probability with which the caps on current and charge hold at a pulse while
                 the skin varies as the tracker expects.
 
@@ -194,8 +203,8 @@ class Controller(Overviewed, Kept):
             RecordingError: A limit is no number.
             ValueError: A limit is not positive, `current_cap` exceeds 0.1 A, `charge_cap` exceeds
                 what `current_cap` carries in a phase, `fallback` is infinite or exceeds what
-                `charge_cap` allows, the probability is not between ½ and 1, or the driver of the
-                tracker is not good.
+                `charge_cap` allows, the probability is not between ½ and 1, `amplitude_step` is
+                negative or too coarse, or the driver of the tracker is not good.
         """
         require("tracker", tracker, Tracker, "Make one with etid.Tracker.of")
         given = {
@@ -249,8 +258,35 @@ class Controller(Overviewed, Kept):
             ceiling=jnp.asarray(float(voltage_cap) / unloaded),
             slew=jnp.asarray(float(slew)),
             fallback=jnp.asarray(min(float(given["fallback"]), allowed)),
+            step=jnp.zeros(()),
         )
-        return cls(tracker, model, limits, most, short)
+        return cls(tracker, model, limits, most, short).stepped(amplitude_step)
+
+    @in_float64
+    def stepped(self, amplitude_step: float) -> "Controller":
+        """The same controller for a stimulator of which the step of the amplitudes is known.
+
+        Args:
+            amplitude_step: As in `Controller.of`.
+
+        Raises:
+            RecordingError: The step is no number.
+            ValueError: It is negative, or so coarse that an electrode could not rise from it.
+        """
+        step, least = number_of("amplitude_step", amplitude_step), 1 / (RAISE - 1)
+        if not 0 <= step < math.inf:
+            raise ValueError(f"amplitude_step is {step}; give a step, or 0 for any amplitude")
+        for name in ("fallback", "short"):
+            largest = float(getattr(self.limits, name))
+            # An amplitude rises by `RAISE`, which must be a step.
+            if step * (1 if name == "fallback" else least) > largest:
+                raise ValueError(
+                    f"amplitude_step is {step:g}, too coarse: without an estimate an electrode "
+                    f"gets at most {largest:.3g}, and rises from there by a quarter. Give a larger "
+                    "charge_cap, or reduce the range of the stimulator"
+                )
+        limits = self.limits._replace(step=jnp.asarray(float(step)))
+        return dataclasses.replace(self, limits=limits)
 
     def _overview(self) -> Overview:
         rows = [
@@ -351,10 +387,22 @@ def _commanded(
         safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), limits.short[None], most[4:]])
         applied = jnp.where(good, most, safe)
         reason = jnp.argmin(applied)
-        amplitude = jnp.where(lane.repeated, 0.0, applied[reason])
+        amplitude = jnp.where(lane.repeated, 0.0, _in_steps(applied, limits.step))
         expected = amplitude * jnp.stack([now.charge, now.charge_stderr, now.peak])
         reason = jnp.where(good, reason, jnp.where(lane.repeated, REPEATED, FALLBACK))
         reason = reason.astype(amplitude.dtype)
         return jnp.stack([amplitude, *jnp.where(good, expected, jnp.nan), reason])
 
     return jax.vmap(electrode, out_axes=1)(electrodes, jnp.asarray(wanted))
+
+
+def _in_steps(most: Float[Array, " limit"], step: Float[Array, ""]) -> Float[Array, ""]:
+    """The amplitude that all limits allow, in whole steps.
+
+    The first limit is what is wanted, in the nearest step. This is at least one step, unless it is
+    0: nothing would be seen of less.
+    """
+    size = jnp.where(step > 0, step, 1.0)
+    wanted = jnp.maximum(jnp.round(most[0] / size), jnp.where(most[0] > 0, 1.0, 0.0))
+    allowed = jnp.floor(jnp.min(most[1:]) / size + 1e-9)  # rounding of n · step / step
+    return jnp.where(step > 0, jnp.minimum(wanted, allowed) * size, jnp.min(most))

@@ -96,15 +96,21 @@ def connected(address: str) -> socket.socket:
     return line
 
 
-def received(line: socket.socket, stopped: Callable[[], bool] = lambda: False) -> Iterator[Block]:
+def received(
+    line: socket.socket,
+    stopped: Callable[[], bool] = lambda: False,
+    stepped: Callable[[float], None] = lambda step: None,
+) -> Iterator[Block]:
     """Blocks from a server, until it closes the connection.
 
     A block is a header of three little-endian 64-bit integers (first sample, electrodes, samples),
-    then the voltages as float64, electrode by electrode.
+    then the voltages as float64, electrode by electrode. A header of 0 samples is no block: its
+    first integer is the number of steps from amplitude 0 to 1.
 
     Args:
         line: Connection to the server.
         stopped: Whether no more blocks are wanted, which is asked while none comes.
+        stepped: Is told the step of the amplitudes, if the server tells it.
 
     Raises:
         ValueError: A header is out of step.
@@ -125,6 +131,9 @@ def received(line: socket.socket, stopped: Callable[[], bool] = lambda: False) -
 
     while len(header := read(24)) == 24:
         first, electrodes, samples = (int(one) for one in np.frombuffer(header, "<i8"))
+        if samples == 0 < min(first, electrodes):
+            stepped(1 / first)
+            continue
         sized = 0 < electrodes <= LARGEST and 0 < samples <= LARGEST // electrodes
         if not (sized and 0 <= first < FARTHEST):
             raise ValueError(
