@@ -31,7 +31,15 @@ from jaxtyping import Array, Float
 import etid
 from benchmarks import control_hazards, control_loop, ngspice
 from benchmarks.charts import INK, new_figure, save
-from benchmarks.control_plant import KINDS, OLDER, Display, Fingertip, by_ngspice, closed_loop
+from benchmarks.control_plant import (
+    KINDS,
+    OLDER,
+    STEP,
+    Display,
+    Fingertip,
+    by_ngspice,
+    closed_loop,
+)
 from benchmarks.ladder import BEFORE, TWO, WHITE
 from benchmarks.machine import RESULTS, write_csv
 from benchmarks.runner import Target, at_most, option, report, show
@@ -168,7 +176,8 @@ def identifying(scene: Scene, display: Display, load: np.ndarray) -> Run:
     records = list(ngspice.record(scene, 0).calibrations.recordings())
     driver, lanes = etid.identify_driver(records), load.shape[1]
     tracker = etid.Tracker.of(driver, records[0], electrodes=lanes, change=CHANGE)
-    controller = etid.Controller.of(tracker, current_cap=CAP, fallback=FALLBACK)
+    limits = {"current_cap": CAP, "fallback": FALLBACK, "amplitude_step": STEP}
+    controller = etid.Controller.of(tracker, **limits)
     last, rows = np.full(lanes, np.nan), []  # charge per unit of amplitude, at the pulse before
     loop = closed_loop(display, controller, load, WANTED)
     for of, (state, command, amplitude) in zip(load, loop, strict=True):

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 import etid
-from benchmarks.control_plant import Display, Load, closed_loop
+from benchmarks.control_plant import STEP, Display, Load, closed_loop
 from benchmarks.ladder import ELECTRONICS, TWO, WHITE
 from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene
@@ -216,7 +216,7 @@ class Hazards:
         tracker = etid.Tracker.of(
             self.driver, self.records[0], electrodes=electrodes, change=CHANGE
         )
-        return etid.Controller.of(tracker, charge_cap=CAP)
+        return etid.Controller.of(tracker, charge_cap=CAP, amplitude_step=STEP)
 
     def given(
         self, controller: etid.Controller, cells: Sequence[str], pulses: int

@@ -31,6 +31,7 @@ PERIODS = 6  # after which a pulse has decayed, even through a short circuit
 SOLVED = 2  # periods that ngspice solves: older pulses leave e^(-8) of the tail of the last one
 OLDER = 3  # pulses whose tails are added, the newest one included
 DELAYS = np.array([-1e-7, 0.0, 1e-7])  # [s] of the trigger, drawn for each window
+STEP = 1 / 1023  # of the amplitudes of a stimulator of 10 bits
 INSULATOR = ResistorLoad(1e12)  # no load, as ngspice has it
 
 Load = Callable[[Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]]
@@ -159,7 +160,8 @@ def closed_loop(
     state = tracker.start(at_rest=True)
     for number, of in enumerate(tqdm(load, leave=False)):
         command = controller.command(state, charge=wanted)
-        amplitude = np.concatenate([command.amplitude[None], amplitude[:-1]])
+        given = STEP * np.rint(command.amplitude / STEP)
+        amplitude = np.concatenate([given[None], amplitude[:-1]])
         yield Pulse(state, command, amplitude)
         v, given = told(number, display.windows(number, of, amplitude), amplitude)
         state = tracker.update(state, v, given)

@@ -19,6 +19,7 @@ from benchmarks import (
     curves,
     online,
     online_alarms,
+    online_instruments,
     peers,
     scale,
     selection,
@@ -94,6 +95,7 @@ SMALLER = {
     amplitude_errors: {"SCENES": amplitude_errors.SCENES[:1], "POINTS": 2**9},
     amplitudes: {"FINER": (4,), "REPEATS": 1},
     curves: {"LANES": (1, 2), "SAMPLES": (1_000,)},
+    online_instruments: {"PULSES": 4},
     online: {"WARM": 3, "NOISES": ((60.0, "before_the_filter"),), "KINDS": 3},
     online_alarms: {"TIMES": 1},
     selection: {

@@ -265,7 +265,7 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(monkeypatch):
     model = object.__new__(GainModel)  # only these two fields are read
     object.__setattr__(model, "bands", types.SimpleNamespace(weight=jnp.asarray(weight)))
     object.__setattr__(model, "noise_freedom", jnp.asarray(1000.0))
-    monkeypatch.setattr(PulseScores, "of", lambda *_: nothing)
+    monkeypatch.setattr(PulseScores, "of", lambda *_: (nothing, jnp.zeros(6)))
     monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
     monkeypatch.setattr(GainModel, "patterns", lambda *_: jnp.zeros((0, 6)))
     pulse = types.SimpleNamespace(jacobian=lambda *_: jnp.zeros((3, 6)))

@@ -183,8 +183,8 @@ class PulseScores(NamedTuple):
         expected: Expected,
         residual: Float[Array, " part"],
         inverse: Float[Array, "own own"],
-    ) -> "PulseScores":
-        """The scores of a pulse.
+    ) -> tuple["PulseScores", Float[Array, " part"]]:
+        """The scores of a pulse, and the residual that neither a gain nor a spread explains.
 
         Args:
             pulse: The objective.
@@ -206,7 +206,11 @@ class PulseScores(NamedTuple):
         common = jnp.sqrt(jnp.sum(of_source**2, axis=1) + d**2 @ pulse.by_x(gain))
         # More noise than stated lessens the weight of a pulse, as it does in a fit of a record.
         sums = jnp.stack([score, information, common], axis=1) / jnp.maximum(chi2, 1.0)[:, None]
-        return cls(jnp.where(tested[:, None], sums, 0.0), -others[0, :-1])
+        left = residual
+        for row, used in zip(d, tested, strict=True):
+            size = jnp.where(used, jnp.dot(row, row), jnp.inf)
+            left = left - row * jnp.dot(row, left) / size
+        return cls(jnp.where(tested[:, None], sums, 0.0), -others[0, :-1]), left
 
     def wrong(self) -> Bool[Array, ""]:
         """Whether sums over pulses show another gain, or a spread, that matters."""

@@ -7,16 +7,17 @@ this pulse and at the one before, each in standard deviations, it follows
 
     |e − e⁻|² / 4.
 
-A residual that does not change is the model's: the difference does not hide another circuit, or a
-gain. Hum that is locked to the pulses, such as 60 Hz with pulses of 60 Hz, does not change, either.
-Up to the seventh multiple of the mains, a residual of five standard deviations is taken for hum,
-and |e|² / 2 for the variance.
+The part of a residual that a gain or another circuit explains (`etid.online.alarms`) is taken out
+before. What does not change is the model's, too: the difference does not hide it. Hum that is
+locked to the pulses, such as 60 Hz with pulses of 60 Hz, does not change, either. Up to the seventh
+multiple of the mains, a residual of seven standard deviations is taken for hum, and |e|² / 2 for
+the variance.
 
 **The line of the mains that falls between the harmonics**, such as 50 Hz with pulses of 60 Hz,
 leaks into all bands, because a window has less than one period of it. Independent noise in each
 band would be wrong by a factor of five. The line is a sine and a cosine of unknown amplitude, each
 a normal variable of each pulse with the deviation h. Its square is the mean of the squares of the
-amplitudes that fit the residuals, where these exceed five standard errors. The covariance of a
+amplitudes that fit the residuals, where these exceed seven standard errors. The covariance of a
 pulse is
 
     C = 1 + Σ p pᵀ
@@ -31,10 +32,11 @@ from jaxtyping import Array, Bool, Float
 from etid.precision import Module
 
 MEMORY = 256  # pulses from which the noise is known
+SOON = 32.0  # pulses from which hum on a harmonic is known
+LINE = 8.0  # pulses from which a line between the harmonics is known
 BEFORE = 64.0  # pulses that the unloaded record counts as
-MEMORY_OF_LINES = 16  # pulses from which the amplitude of a line is known
 FAINT = 0.1  # least deviation of a line, relative to the standard error of its amplitude
-GROSS = 12.0  # |e|² / 2 of hum; noise exceeds it once in 160 000 pulses
+GROSS = 24.5  # of |e|² / 2 of hum: seven standard deviations
 JUMP = 25.0  # largest growth of the variance that a pulse may show
 
 
@@ -101,14 +103,16 @@ class Noise(Module):
             / jnp.maximum(jnp.sum(~hum, dtype=own.dtype), 1.0)
         )
         gross = GROSS * jnp.maximum(elsewhere, 1.0)
-        found = jnp.minimum(change / 4, JUMP)
-        found = jnp.where(hum & (own / 2 * self.bands > gross), own / 2, found)
-        bands = self.bands * (1 + (found - 1) / (jnp.minimum(BEFORE + self.pulses, MEMORY - 1) + 1))
+        heard = hum & (own / 2 * self.bands > gross)
+        found = jnp.where(heard, own / 2, jnp.minimum(change / 4, JUMP))
+        known = jnp.where(heard, SOON, jnp.minimum(BEFORE + self.pulses, MEMORY - 1) + 1)
+        bands = self.bands * (1 + (found - 1) / known)
         bands = jnp.where(shown & jnp.isfinite(bands), bands, self.bands)
-        number = jnp.minimum(self.pulses, MEMORY_OF_LINES - 1)
         squares, size = (of.reshape(-1, 2).mean(axis=1) for of in (fitted**2 * size, size))
-        line = jnp.where(squares > gross, squares / size, 0.0)  # h², relative to what was known
-        squares = self.line**2 * (1 + (line - 1) / (number + 1))
+        # Cleared, an amplitude is smaller by 1 − |p|² / (1 + |p|²).
+        heard = squares > gross * jnp.maximum(1 - size, 1e-12)
+        line = jnp.where(heard, squares / size, 0.0)  # h², relative to what was known
+        squares = self.line**2 * (1 + (line - 1) / LINE)
         lines = jnp.sqrt(jnp.maximum(squares, self.least**2))
         return Noise(
             bands=bands,

@@ -78,7 +78,8 @@ class Attempt(NamedTuple):
         rrse: RRSE of the pulse.
         result: Verdict.
         scores: Scores of a gain and of a spread.
-        residual: Residual of the pulse, of variance 1 if the noise is as expected.
+        residual: Residual of the pulse that no gain and no spread explains, of variance 1 if the
+            noise is as expected.
         lines: Lines of the mains, as the residual.
     """
 
@@ -303,7 +304,7 @@ def attempt(
     by_delay = at.curvature[:-1, -1]
     told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
     inverse = inverse_of_few(at.curvature)
-    scores = PulseScores.of(pulse, expected, residual, inverse)
+    scores, unexplained = PulseScores.of(pulse, expected, residual, inverse)
     late = jnp.abs(LoadUnknowns.of(own).delay_samples) > DELAYS[-1]
     result = first_verdict(
         (measured.bad != SUCCESSFUL, measured.bad),
@@ -322,7 +323,7 @@ def attempt(
         rrse,
         result,
         scores,
-        residual / jnp.sqrt(left),
+        unexplained / jnp.sqrt(left),
         cleared(patterns, lines),
     )
 
