@@ -72,7 +72,7 @@ def drifting(display: Fingertip, electrodes: int, pulses: int) -> Float[np.ndarr
         np.concatenate(
             [
                 sampler.sample(v_th * loading(load(sampler.f), z_th), size, start)
-                for size, start in zip(np.diff(ends), starts, strict=True)
+                for size, start in zip(np.diff(ends).tolist(), starts, strict=True)
             ]
         )
         for load in LOADS

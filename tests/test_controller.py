@@ -270,8 +270,8 @@ def test_a_stimulator_of_a_few_bits_gives_what_it_is_told(bits):
     step, (tracker, *_), pulses = 1 / (2**bits - 1), ten(), alone()
     controller = etid.Controller.of(tracker, charge_cap=120e-9, amplitude_step=step)
     state, before, seen = tracker.start(at_rest=True), np.zeros(TEN), 0
+    command = controller.command(state, charge=80e-9)
     for number in range(25):
-        command = controller.command(state, charge=80e-9)
         given = step * np.rint(command.amplitude / step)
         np.testing.assert_allclose(given, command.amplitude, rtol=1e-12)
         shapes = tiled([pulses[name][number % 3] for name in ("dry", "damp")])
@@ -280,6 +280,7 @@ def test_a_stimulator_of_a_few_bits_gives_what_it_is_told(bits):
         good = tracker.read(state).verdicts == "successful"
         seen += int(good.sum())
         assert (np.abs(off(tracker.read(state), tiled(TRUTH)))[good] < 5).all()
+        command = controller.command(state, charge=80e-9)
     assert set(command.reason) == {"wanted"}
     assert seen > 22 * TEN
     delivered = command.amplitude * tiled([true_charge(DRY), true_charge(DAMP)])
