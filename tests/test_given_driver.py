@@ -31,7 +31,7 @@ def information(driver):
     noisy = Scene((), KNOWN).simulate(seed=3)["c"]
     rate, size = record.sample_rate, record.v_th.size
     both = harmonics(np.stack([record.v_th, record.v_out]), 3, size)
-    f, x, *_, selected = map(np.asarray, filled(both, np.zeros(2), rate, 3, size))
+    f, x, *_, selected = map(np.asarray, filled(both, 0 * abs(both), rate, 3, size))
     sigma_th, sigma_out = (float(noise(v, np.asarray(0.0))) for v in (noisy.v_th, noisy.v_out))
     parameters, unflatten = ravel_pytree(driver.source)
     at = jnp.append(parameters, driver.calibration.delay_samples[0])

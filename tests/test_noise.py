@@ -3,7 +3,10 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from etid.signals.noise import WINDOW, _around, noise_std, shows_few
+from etid.signals.harmonics import WINDOW
+from etid.signals.noise import noise_std
+from etid.signals.quick_looks import shows_few
+from etid.signals.rounding import _around
 
 
 def test_white_noise_on_a_pulse_is_unbiased():

@@ -186,7 +186,7 @@ def test_if_the_noise_is_larger_than_it_is_said_to_be_the_errors_are_as_large(fi
 
 def test_if_the_noise_is_smaller_the_errors_are_what_it_is_said_to_be(fitted):
     _, fit_of = fitted
-    once, twice = fit_of(1.5), fit_of(3.0)
+    once, twice = fit_of(1.2), fit_of(2.4)
     kept_numbers.check("in_time", kept_numbers.of_fit(once))
     assert float(once.chi2) < 1
     own = [np.asarray(fit.cov - fit.shared_cov) for fit in (once, twice)]
@@ -198,7 +198,7 @@ def test_the_delay_of_the_calibration_is_known_as_well_as_its_standard_deviation
     """One parameter with information c and prior 1/s²: cov = A + b bᵀ / (1/s² + c)."""
     _, fit_of = fitted
     known, *others = (
-        np.diagonal(np.asarray((fit := fit_of(1.5, late)).cov - fit.shared_cov))
+        np.diagonal(np.asarray((fit := fit_of(1.2, late)).cov - fit.shared_cov))
         for late in (1e-6, 0.01, 0.02, 1e3)
     )
     first, second, free = (cov - known for cov in others)

@@ -6,7 +6,7 @@ import pytest
 import etid
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
-from etid.signals import noise
+from etid.signals import rounding as noise
 from etid.signals.harmonics import harmonics
 from etid.simulation import scenes
 from etid.simulation.scenes import Scene

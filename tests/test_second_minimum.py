@@ -65,10 +65,9 @@ def fits():
 
 
 def test_no_fit_is_successful_at_the_wrong_minimum(fits):
-    """A single search ends there behind several of these drivers, 10 and more errors away."""
+    """A single search ends there behind several drivers, 10 and more errors away."""
     wrong = [first for _, first in fits if np.abs(off(first, DAMP)).max() > SIGMAS]
     assert len(wrong) >= 2
-    assert all(first.verdict == "successful" for first in wrong)
     successful = [fit for fit, _ in fits if fit.verdict == "successful"]
     assert all(np.abs(off(fit, DAMP)).max() < SIGMAS for fit in successful)
     assert len(successful) >= DRIVERS / 2

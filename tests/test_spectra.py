@@ -16,7 +16,9 @@ SLOW = 50e3
 
 def spectrum(both, sigma, periods, samples):
     """Fields of a spectrum."""
-    return filled(harmonics(both, periods, samples), sigma, RATE, periods, samples)
+    found = harmonics(both, periods, samples)
+    power = sigma[:, None] ** 2 / samples + 0 * abs(found)
+    return filled(found, power, RATE, periods, samples)
 
 
 @pytest.mark.parametrize(

@@ -34,9 +34,14 @@ NEAR_MINIMUM = (
     "own model"
 )
 NOISE = (
-    "The variances of the noise were estimated from each record by the median of its differences "
-    "of sixth order; fits at harmonics add 1/f noise where the bins between the harmonics surely "
-    "show it."
+    "The noise of samples was taken for white, with the variance that each record shows between "
+    "1/128 and 1/8 of the sample rate."
+)
+NOISE_BY_FREQUENCY = (
+    "The variance of the noise at each harmonic was measured in each record: in the bins of the "
+    "Fourier transform between the harmonics, where repeated pulses leave nothing (Pintelon and "
+    "Schoukens, 2012, ch. 2), or in the quiet part of a single period. A record that is never "
+    "quiet was taken to have white noise if its periods end between samples."
 )
 BY_RESIDUALS = (
     "were made with the variance that the residuals have around each harmonic where that exceeds "

@@ -23,8 +23,9 @@ from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
 from etid.signals.harmonics import ALIASED, Spectrum, aliases, filled, harmonics, joins_aliases
-from etid.signals.noise import Measurement, coloured, rounding_variance
+from etid.signals.noise import Measurement, noise_of
 from etid.signals.pulse_train import rest, shifted
+from etid.signals.rounding import rounding_variance
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
 LANES = 64  # lanes or circuits of one call; the last call is padded
@@ -139,16 +140,10 @@ class Harmonics(AbstractLane):
         """The fields of a lane, in their order."""
         rate = np.asarray(seen.recording.sample_rate)
         frequency, x, y, *variances, selected = seen.spectrum
-        known = zip(
-            seen.quiet, seen.recorded, seen.trusted, seen.coarse, seen.flickers, strict=True
-        )
-        for number, (v, recorded, sigma, step, flickers) in enumerate(known):
+        for number, (recorded, step) in enumerate(zip(seen.recorded, seen.coarse, strict=True)):
             if step > 0:
                 rounded = rounding_variance(recorded, float(step), *seen.periods)
                 variances[number] = np.append(rounded, variances[number][rounded.size :])
-            elif flickers:
-                of = v, float(sigma), frequency, float(rate)
-                variances[number] = variances[number] * coloured(*of, *seen.periods)
         if joins_aliases(*seen.periods) and not seen.has_no_aliases:
             of_both = zip((x, y), variances, strict=True)
             variances = [v + aliases(of, v, *seen.periods).variance for of, v in of_both]
@@ -166,8 +161,11 @@ class Harmonics(AbstractLane):
         if periods[0] == 0:
             raise ValueError(f"no whole pulse period in {several(m.v_out.shape[0], 'sample')}")
         both = harmonics(jnp.stack([of[: periods[1]] for of in (m.v_th, m.v_out)]), *periods)
-        sigma = jnp.stack([m.sigma_th, m.sigma_out])
-        fields = map(jnp.asarray, filled(both, sigma, m.sample_rate, *periods))
+        records = jnp.stack([m.v_th, m.v_out])
+        least = jnp.stack([m.sigma_th, m.sigma_out])[:, None] ** 2 / periods[1]
+        found = jax.vmap(lambda v: noise_of(v, *periods).power)(records)
+        noise = jax.lax.stop_gradient(jnp.maximum(found, least))
+        fields = map(jnp.asarray, filled(both, noise, m.sample_rate, *periods))
         frequency, x, y, of_x, of_y, selected = fields
         if joins_aliases(*periods):
             # As the noise, they are no data of the fit: derivatives by the records hold them.

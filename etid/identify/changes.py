@@ -178,7 +178,7 @@ def _equations(
         without aliases and with them; units of the parameters, which make the diagonal of the
         equations 1; Σ η² / variance for each course.
     """
-    high: np.ndarray = np.greater(of.frequency, 0.03 * of.sample_rate[:, None])  # aliases begin
+    high = of.aliased
     plain = course @ of.gain
     turn = of.turn.conj()
     aliased = (turn[:, :, None] * of.gain).sum(1)

@@ -6,9 +6,10 @@ from collections.abc import Hashable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 
 from etid.recordings.recording import Recording, Samples, quietly
+from etid.signals.averaging import weighted, weights
 from etid.signals.disturbances import (
     Joint,
     Shifts,
@@ -18,22 +19,23 @@ from etid.signals.disturbances import (
     of_source,
     shifts,
 )
-from etid.signals.harmonics import filled, harmonics, whole_periods
+from etid.signals.harmonics import filled, harmonics, separates_aliases, whole_periods
 from etid.signals.mains import Hum, separated
-from etid.signals.noise import (
-    RIPPLE,
-    VISIBLE,
-    is_coarse,
-    noise_std,
-    quietest,
-    shows_few,
-    step_of,
+from etid.signals.noise import RIPPLE, Noise, noise_of
+from etid.signals.pulse_train import (
+    PulseTrain,
+    clocks_apart,
+    lags_of,
+    late,
+    pulse_trains,
+    rise_time,
 )
-from etid.signals.pulse_train import PulseTrain, clocks_apart, lags_of, pulse_trains, rise_time
-from etid.signals.quick_looks import flickering, humming, uneven
+from etid.signals.quick_looks import humming, shows_few, uneven
+from etid.signals.rounding import VISIBLE, is_coarse, step_of
 
 _Key = TypeVar("_Key", bound=Hashable)
 SEAM = 3  # samples on each side of the joint between two periods
+SURE = 5.0  # [standard errors] a delay of the last period that is not by chance
 BY_CHANCE = 4.0  # [standard deviations] largest difference that noise makes
 
 
@@ -55,6 +57,8 @@ class Group:
         self.sample_rate = recordings[0].sample_rate
         self.pulse_rate = recordings[0].pulse_rate
         self._spectra: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
+        self._exact: dict[int, float] = {}
+        self._noises: dict[tuple[bool, int, int], Noise] = {}
 
     @functools.cached_property
     @quietly()
@@ -87,13 +91,27 @@ class Group:
     @functools.cached_property
     @quietly()
     def noise(self) -> Float[np.ndarray, "recording 2"]:
-        """Standard deviations of the noise of a sample of `whole` [V]."""
-        found = np.asarray(noise_std(self.whole, self.step))
-        for row, train in enumerate(self.trains):
-            for which, v in enumerate(self.whole[row]):
-                quiet = quietest(v, float(found[row, which]), self.sample_rate / train.counted)
-                found[row, which] = max(quiet, self.step[row, which] / math.sqrt(12.0))
-        return found
+        """Standard deviations of the noise of a sample of `whole` [V]; see `Noise.std`."""
+        found = np.zeros((len(self.recordings), 2))
+        whole = 1, self.whole.shape[2]
+        known = [
+            of if of[0] and not train.mismatch else whole
+            for of, train in zip(self.whole_periods, self.trains, strict=True)
+        ]
+        for (periods, samples), rows in _alike(known).items():
+            found[rows] = self._noise(self.whole, periods, samples).std(samples)[rows]
+        return np.maximum(found, self.step / math.sqrt(12.0))
+
+    def _noise(
+        self, records: Float[np.ndarray, "recording 2 time"], periods: int, samples: int
+    ) -> Noise:
+        """The noise of `whole` or of `quiet`."""
+        key = records is self.whole, periods, samples
+        if key not in self._noises:
+            lengths = [self.sample_rate / train.counted for train in self.trains]
+            rest = np.repeat(periods * np.array(lengths)[:, None] - samples, 2, axis=1)
+            self._noises[key] = noise_of(records, periods, samples, rest)
+        return self._noises[key]
 
     @functools.cached_property
     @quietly()
@@ -235,28 +253,70 @@ class Group:
                 found[rows[row]] = _repeats(records[row], sigma[row], spacing, samples)
         return found
 
-    @functools.cached_property
     @quietly()
-    def flickers(self) -> Bool[np.ndarray, "recording 2"]:
-        """Whether each record in `quiet` may have 1/f noise, by a quick look.
-
-        Joints between periods look like it, so that those of joined periods have none.
-        """
-        found = np.zeros(self.noise.shape, bool)
-        if self._cut > 0:
-            return found
-        for of, rows in _alike(self.whole_periods).items():
-            found[rows] = flickering(_part(self.quiet, rows), self.trusted[rows], *of)
-        return found
+    def noise_of_quiet(self, periods: int, samples: int) -> Noise:
+        """The noise of `quiet`: at least the rounding and the error of the interpolation."""
+        least = np.maximum(RIPPLE * np.ptp(self.limits, axis=-1), self.step / math.sqrt(12.0))
+        noise = self._noise(self.quiet, periods, samples)
+        return noise._replace(power=np.maximum(noise.power, least[..., None] ** 2 / samples))
 
     @quietly()
     def spectra(self, periods: int, samples: int) -> tuple[np.ndarray, ...]:
         """`etid.signals.harmonics.filled` for `quiet` and numbers from `whole_periods`."""
         if (periods, samples) not in self._spectra:
             found = np.asarray(harmonics(self.quiet, periods, samples))
-            fields = filled(found, self.trusted, self.sample_rate, periods, samples)
-            self._spectra[periods, samples] = tuple(map(np.asarray, fields))
+            noise = self.noise_of_quiet(periods, samples)
+            power = np.array(noise.power)
+            for row in self._aliased(found, power, periods, samples):
+                spacing = self.spacing(row)
+                of = weights(spacing % 1, periods)
+                v = weighted(self.quiet[row, :, :samples], spacing, of)
+                found[row] = harmonics(v, periods, samples)
+                power[row] *= periods * float(of @ of)
+            *fields, selected = filled(found, power, self.sample_rate, periods, samples)
+            usable = np.repeat(selected[None], len(self.recordings), axis=0)
+            of_ends = np.asarray(noise.of_ends).any(axis=1)
+            coarse = np.any(self.coarse, axis=1, keepdims=True)  # its quiet parts say little
+            usable[:, : power.shape[-1]] &= coarse | ~of_ends
+            self._spectra[periods, samples] = *map(np.asarray, fields), usable
         return self._spectra[periods, samples]
+
+    def spacing(self, row: int) -> float:
+        """Length of a period [samples]; by the phases of its pulses if aliases need it."""
+        known = self.sample_rate / self.trains[row].counted
+        return self._exact.get(row, known)
+
+    def _exactly(self, row: int, periods: int) -> float:
+        """`spacing` by the phases of the first and the last pulse, if they surely differ."""
+        spacing, edges = self.spacing(row), self.trains[row].edges
+        by, error = late(self.quiet[row, 0], int(edges[0]), spacing, periods)
+        # Aliases look like up to 0.05 samples.
+        return spacing + by / (periods - 1) if abs(by) > max(SURE * error, 0.05) else spacing
+
+    def _aliased(
+        self,
+        found: Complex[np.ndarray, "recording 2 harmonic"],
+        power: Float[np.ndarray, "recording 2 harmonic"],
+        periods: int,
+        samples: int,
+    ) -> list[int]:
+        """Rows whose aliases would leak into their harmonics by more than the noise."""
+        if periods < 3 or not separates_aliases(periods, samples) or self._cut > 0:
+            return []
+        top = slice(int(0.9 * found.shape[-1]), None)  # where aliases are as large as the signal
+        loud = np.square(np.abs(found[:, 0, top])).mean(-1) / power[:, 0, top].mean(-1)
+        rows = []
+        middle = samples // periods  # a joint, where pulses must be at rest
+        at = np.abs(self.quiet[:, 0, middle] - self.quiet[:, 0].mean(-1))
+        loud = np.where(at < 0.1 * np.ptp(self.limits[:, 0], axis=-1), loud, 0.0)
+        for row in np.flatnonzero(loud > 1).tolist():
+            if self.trains[row].spacing is None:
+                continue
+            self._exact[row] = spacing = self._exactly(row, periods)
+            turns = np.exp(2j * np.pi * spacing * np.arange(periods))
+            if abs(turns.mean()) ** 2 * loud[row] > 0.1:
+                rows.append(row)
+        return rows
 
 
 def _records(recording: Recording) -> tuple[Samples, Samples]:

@@ -17,6 +17,7 @@ from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, aliases, have_ended, joins_aliases
 from etid.signals.mains import Hum
+from etid.signals.noise import Noise
 from etid.signals.pulse_train import PulseTrain, largest_drift, rise_time, shifted, whole_lag
 
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
@@ -59,7 +60,6 @@ class Inspected:
     recorded_limits: Float[np.ndarray, "2 limit"] = _in_use("recorded_limits")
     limits: Float[np.ndarray, "2 limit"] = _in_use("limits")
     covariance: Float[np.ndarray, "2 2"] = _in_use("covariance")
-    flickers: Bool[np.ndarray, "2"] = _in_use("flickers")
     correlated: float | None = _in_use("lags")
     periods: tuple[int, int] = _in_use("whole_periods")
 
@@ -116,7 +116,9 @@ class Inspected:
     @property
     def begins(self) -> Float[np.ndarray, " period"]:
         """Start of each period of `v_th` [samples]."""
-        return self.spacing * np.arange(self.periods[0]) if self.kept is None else self.kept.begins
+        if self.kept is not None:
+            return self.kept.begins
+        return self._group.spacing(self._row) * np.arange(self.periods[0])
 
     @property
     def hums(self) -> bool:
@@ -212,9 +214,15 @@ class Inspected:
 
     @property
     def spectrum(self) -> tuple[np.ndarray, ...]:
-        """The fields of an `etid.signals.harmonics.Spectrum` of both voltages; white noise."""
-        frequency, *of_rows, selected = self._used.spectra(*self.periods)
-        return frequency, *(field[self._place] for field in of_rows), selected
+        """The fields of an `etid.signals.harmonics.Spectrum` of both voltages."""
+        frequency, *of_rows = self._used.spectra(*self.periods)
+        return frequency, *(field[self._place] for field in of_rows)
+
+    @property
+    def noise(self) -> Noise:
+        """The noise of both voltages at each harmonic; less than a period is taken for one."""
+        periods, samples = self.periods if self.periods[0] else (1, self.quiet.shape[1])
+        return Noise(*(of[self._place] for of in self._used.noise_of_quiet(periods, samples)))
 
     @property
     def is_aliased(self) -> bool:

@@ -35,8 +35,8 @@ from etid.recordings.fields import (
 )
 from etid.recordings.splitting import split
 from etid.signals.missing import unmasked
-from etid.signals.noise import printed_step
 from etid.signals.pulse_train import find_pulses
+from etid.signals.rounding import printed_step
 
 # Infinite samples get a verdict; neighbours of a damaged recording are not concerned.
 quietly = functools.partial(np.errstate, invalid="ignore", over="ignore")

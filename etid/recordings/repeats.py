@@ -27,14 +27,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from etid.recordings.preflight import Inspected
+from etid.signals.harmonics import aliases
 from etid.signals.pulse_train import RATE, fast_length
 
 # Relative to the sample rate. Below it, bands share one estimate of their noise. Above it, aliases
 # can exceed the noise; each band then has its own.
 PLAIN = 0.25
+ALIASES = 0.03  # of the sample rate; above, a change is not told from aliases
 ALIGNED = 1e-3  # [samples] a smaller delay changes the gain in proportion
 TINY = 1e-30  # replaces the power of a record of zeros
 SURE = 5.0  # [standard deviations] the noise of a band must exceed that of all bands by this
@@ -54,6 +56,7 @@ class Repeats(NamedTuple):
         variance: Variance of the real part of a weighted sum of `gain` over the periods, if the
             squares of the weights have the sum 1. The imaginary part has the same variance.
         turn: Direction of the aliases; its length is 1, or 0 if all cuts have the same delay.
+        aliased: Bands whose aliases may exceed the noise.
         unloaded: Deviation of the amplitude of V_th.
         unloaded_variance: Variance of `unloaded`, defined as `variance`.
     """
@@ -65,6 +68,7 @@ class Repeats(NamedTuple):
     smooth: Complex[np.ndarray, "*lane polynomial band"]
     variance: Float[np.ndarray, "*lane band"]
     turn: Complex[np.ndarray, "*lane period"]
+    aliased: Bool[np.ndarray, "*lane band"]
     unloaded: Float[np.ndarray, "*lane period"]
     unloaded_variance: Float[np.ndarray, "*lane"]
 
@@ -163,17 +167,17 @@ def _of_equal_periods(
     sample_rate, pulse_rate = recording.sample_rate, recording.pulse_rate
     at = np.stack([one.begins for one in group])
     layout = bands(sample_rate, pulse_rate, 0.4)
-    sigma_th, sigma = np.array([one.trusted for one in group]).T
     # Without this shift, a late record would be cut within its pulses.
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
-    own = _deviations(loaded, at, layout, sigma)
+    own = _deviations(loaded, at, layout, _noise(group, 1, layout))
     if group[0].has_current:
-        other = _deviations([current for current, _ in records], at, layout, sigma_th)
+        currents = [current for current, _ in records]
+        other = _deviations(currents, at, layout, _noise(group, 0, layout))
         return _of_currents(sample_rate, layout, own, other)
     # Of V_th only the amplitude is wanted. If some of the samples were left out, the aliases of its
     # edges would look like another amplitude in each period: by 1e-3 if every fourth remains.
     low = bands(sample_rate, pulse_rate, 1 / 32)
-    unloaded = _deviations([v_th for v_th, _ in records], at, low, sigma_th)
+    unloaded = _deviations([v_th for v_th, _ in records], at, low, _noise(group, 0, low))
     weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low)
     # Effect of an amplitude change by 1 after the projection of the polynomials.
     unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power
@@ -189,7 +193,8 @@ def _of_equal_periods(
     # Because cuts fall between samples, the amplitude differs by 1e-4 for 133 samples of a pulse,
     # by 0.03 for 8 samples.
     variance = noise / total + (2 / np.square(width)) ** 2
-    parts = own.gain, own.power, smooth, own.variance, _turn(own.late), amplitude, variance
+    turn, aliased = _turn(own.late), _aliased(group, layout)
+    parts = own.gain, own.power, smooth, own.variance, turn, aliased, amplitude, variance
     return _rows(sample_rate, layout, parts)
 
 
@@ -236,7 +241,8 @@ def _of_currents(
         smooth.append(np.add.reduceat(mean[row].conj() * basis, layout.edges, axis=1))
     none = np.zeros(own.late.shape)  # an amplitude that changes in both records does no harm
     parts = np.stack(gain), power, np.stack(smooth), 1 / power, _turn(own.late)
-    return _rows(sample_rate, layout, (*parts, none, np.ones(len(none))))
+    aliased = np.tile(layout.middle > 2 * np.pi * ALIASES, (len(none), 1))
+    return _rows(sample_rate, layout, (*parts, aliased, none, np.ones(len(none))))
 
 
 def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
@@ -258,6 +264,33 @@ def _turned(v_out: Float[np.ndarray, " time"], of: Inspected) -> Float[np.ndarra
     return np.roll(v_out[: of.periods[1]], -of.lag) if of.lag else v_out
 
 
+def _aliased(group: Sequence[Inspected], layout: Bands) -> Bool[np.ndarray, "lane band"]:
+    """`Repeats.aliased`: above `ALIASES`, and where what continues V_out beyond is too large.
+
+    Aliases of the n harmonics of a band add up, noise does not.
+    """
+    found = []
+    for one in group:
+        frequency, _, y, _, variance, _ = one.spectrum
+        angle = frequency * (2 * np.pi / one.recording.sample_rate)
+        ratio = aliases(y, variance, *one.periods).power / variance
+        found.append(np.interp(layout.middle, angle, ratio) * layout.number > 0.1)
+    return np.stack(found) | (layout.middle > 2 * np.pi * ALIASES)
+
+
+def _noise(
+    group: Sequence[Inspected], record: int, layout: Bands
+) -> Float[np.ndarray, "lane band"]:
+    """Variance of the real part of a harmonic of one period, in each band of one of the records."""
+    found = []
+    for one in group:
+        frequency, *_, variance_x, variance_y, _ = one.spectrum
+        angle = frequency * (2 * np.pi / one.recording.sample_rate)
+        variance = np.interp(layout.middle, angle, (variance_x, variance_y)[record])
+        found.append(variance * one.periods[1] * (layout.length / 2))
+    return np.stack(found)
+
+
 class _Deviations(NamedTuple):
     """`gain`, `power` and `variance` as in `Repeats`, mean, delay of each cut, `_transforms`."""
 
@@ -273,25 +306,31 @@ def _deviations(
     records: Sequence[Float[np.ndarray, "_"]],
     at: Float[np.ndarray, "lane period"],
     layout: Bands,
-    sigma: Float[np.ndarray, " lane"],
+    least: Float[np.ndarray, "lane band"],
 ) -> "_Deviations":
-    """Deviations of the periods with the starts `at` [samples]."""
+    """Deviations of the periods with the starts `at` [samples] and at least this `_noise`."""
     periods = at.shape[1]
     last = np.array([v.size - layout.length for v in records])
     starts = np.minimum(np.rint(at), last[:, None]).astype(int)  # samples at which periods are cut
     late = starts - at
     raw = _transforms(records, starts, layout)
     power, mean, weight, gain = _compared(raw, late, layout)
+    line = np.arange(periods) - (periods - 1) / 2
+    line /= np.linalg.norm(line)
     for _ in range(5):  # a clock error of 200 ppm needs three
         # Least-squares estimate of a delay, η = jωτ; it is approximate if the gain changes too.
-        of_delay = layout.middle * weight
+        of_delay = layout.middle * weight / least
         total = (layout.middle * of_delay).sum(1)
         more = (np.imag(gain) * of_delay[:, None, :]).sum(2) / total[:, None]
-        surely = np.maximum(ALIGNED, SURE * sigma * np.sqrt(layout.length / total))
-        moved = np.abs(more).max(1) > surely
+        surely = np.maximum(ALIGNED, SURE / np.sqrt(total))
+        # Two clocks make a line of the delays, which is known better than each of them.
+        slope = more @ line
+        by_line = np.abs(slope) > surely
+        singly = np.abs(more).max(1) > 1.5 * surely
+        moved = by_line | singly
         if not moved.any():
             break
-        late = late + np.where(moved[:, None], more, 0.0)
+        late = late + np.where(singly[:, None], more, np.where(by_line, slope, 0)[:, None] * line)
         again = _compared(raw[moved], late[moved], layout)
         for whole, part in zip((power, mean, weight, gain), again, strict=True):
             whole[moved] = part
@@ -299,23 +338,24 @@ def _deviations(
     rest = np.add.reduceat(power, layout.edges, axis=1) - weight * _power(gain).sum(1)
     freedom = 2 * (layout.number - 1) * (periods - 1)
     plain = layout.middle < 2 * np.pi * PLAIN
-    overall = rest[:, plain].sum(1) / max(freedom[plain].sum(), 1)
-    overall = np.maximum(overall, sigma**2 * layout.length / 2)[:, None]
+    excess = (rest / least)[:, plain].sum(1) / max(freedom[plain].sum(), 1)
+    overall = np.maximum(excess, 1.0)[:, None] * least
     freedom = np.maximum(freedom, 1)
     sure = rest > overall * (freedom + SURE * np.sqrt(2 * freedom))
     noise = np.where(sure & (layout.number > 1), rest / freedom, overall)
     single = np.count_nonzero(layout.number == 1)
     if single > 2:
-        low = _noise_of_single(gain[:, :, :single], weight[:, :single])
-        sure = low > overall[:, 0] * (1 + SURE * math.sqrt(2 / ((single - 2) * (periods - 1))))
-        noise[:, :single] = np.where(sure, low, overall[:, 0])[:, None]
+        low = _noise_of_single(gain[:, :, :single], (weight / overall)[:, :single])
+        sure = low > 1 + SURE * math.sqrt(2 / ((single - 2) * (periods - 1)))
+        noise[:, :single] = np.where(sure, low, 1.0)[:, None] * overall[:, :single]
     return _Deviations(gain, weight, noise / weight, mean, late, raw)
 
 
 def _noise_of_single(gain: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Noise of the bands of one harmonic, from second differences between these bands.
+    """Noise of the bands of one harmonic relative to 1/weight.
 
-    A change of the load is smooth over the first harmonics; coloured noise is not.
+    It is found from second differences between these bands. A change of the load is smooth over the
+    first harmonics; coloured noise is not.
     """
     bend = gain[:, :, :-2] - 2 * gain[:, :, 1:-1] + gain[:, :, 2:]
     spread = 1 / weight[:, :-2] + 4 / weight[:, 1:-1] + 1 / weight[:, 2:]

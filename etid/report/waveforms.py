@@ -119,7 +119,8 @@ def waveforms(found: StudyFits, study: Study | None, problem: str) -> Section:
         heading, text, chosen = "Waveform", "One pulse.", {0: ""}
     text += (
         " If the model is right, the residual is noise. At the edges of a pulse it also contains "
-        "frequencies near half the sample rate, which are aliased and not fitted."
+        "frequencies near half the sample rate, which are aliased and not fitted. The lowest panel "
+        "shows it by frequency, beside the noise that the fit expects there."
     )
     pictures, missing = [], []
     for row, reason in chosen.items():

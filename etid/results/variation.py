@@ -68,7 +68,11 @@ class Variation(Overviewed):
 
     def _overview(self) -> Overview:
         rows = [
-            (f"between {name}{'' if name == REST else 's'}", *map(_per_cent, part))
+            # A search for the minimum at 0 ends near it.
+            (
+                f"between {name}{'' if name == REST else 's'}",
+                *(_per_cent(of) if of > 1e-3 * max(part) else "0 %" for of in part),
+            )
             for name, part in self.between.items()
         ]
         rows.append(("error of a fit", _per_cent(self.error), "", ""))

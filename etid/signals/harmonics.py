@@ -180,7 +180,7 @@ def signal_share(
 
 def filled(
     coefficients: Complex[Array | np.ndarray, "*recording 2 harmonic"],
-    sigma: Float[Array | np.ndarray, "*recording 2"],
+    noise: Float[Array | np.ndarray, "*recording 2 harmonic"],
     sample_rate: Float[Array | np.ndarray, ""] | float,
     periods: int,
     samples: int,
@@ -195,7 +195,7 @@ def filled(
 
     Args:
         coefficients: `harmonics` of the unloaded and of the loaded voltage [V].
-        sigma: Standard deviations of the white noise of their samples [V].
+        noise: Their E|noise|² [V²], from `etid.signals.noise.noise_of`.
         sample_rate: Sampling rate [Hz].
         periods: Number of periods from `whole_periods`.
         samples: Number of samples from `whole_periods`.
@@ -203,10 +203,9 @@ def filled(
     xp, count = namespace(coefficients), coefficients.shape[-1]
     number = np.arange(1.0, count + -count % 64 + 1)
     frequency = number * (periods * sample_rate / samples)
-    noise = sigma[..., None] / math.sqrt(samples)
-    scale = xp.where(number <= count, noise, ABSENT * noise)
-    absent = scale[..., count:].astype(coefficients.dtype)
-    padded, variance = xp.concatenate([coefficients, absent], axis=-1), scale**2
+    absent = xp.broadcast_to(ABSENT**2 * noise[..., :1], (*noise.shape[:-1], number.size - count))
+    padded = xp.concatenate([coefficients, absent.astype(coefficients.dtype) ** 0.5], axis=-1)
+    variance = xp.concatenate([noise, absent], axis=-1)
     (x, y), (variance_x, variance_y) = (xp.moveaxis(both, -2, 0) for both in (padded, variance))
     highest = 0.5 if separates_aliases(periods, samples) else ALIASED
     selected = (frequency < highest * sample_rate) & (number <= count)

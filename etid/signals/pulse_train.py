@@ -22,6 +22,9 @@ SURE = 5.0  # that drift must have so many standard errors, or noise hides it
 STEADY = 0.25  # part of the drift by which a pulse in the middle may be off its place
 TINY = 1e-300  # replaces the power of an edge of zeros
 RATE = 2e-3  # relative error of pulse_rate; a larger one is a wrong number, not an inexact clock
+# Relative to the sample rate. Below the first, the drift of the mean is larger than a delay; above
+# the second, aliases are a twentieth of the signal.
+PHASES = 0.005, 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,6 +245,35 @@ def highest(correlation: Float[np.ndarray, "*record lag"]) -> Float[np.ndarray, 
     inside = (top > 0) & (top < last) & (bend != 0)
     beside = np.where(inside, 0.5 * (left - right) / np.where(inside, bend, 1.0), 0.0)
     return np.asarray(top + beside)
+
+
+def late(
+    v: Float[np.ndarray, " time"], first: int, spacing: float, periods: int
+) -> tuple[float, float]:
+    """How much later the last pulse is than this spacing says [samples], and its standard error.
+
+    It is the slope of the phase between the transforms of the first and the last pulse.
+
+    Args:
+        v: The record.
+        first: An edge of its first pulse [samples].
+        spacing: Length of a period [samples].
+        periods: Number of whole periods.
+    """
+    size = fast_length(int(spacing / 4))
+    begin = max(first - size // 4, 0)
+    again = begin + round((periods - 1) * spacing)
+    if again + size > v.size:  # the last pulse is cut
+        return 0.0, np.inf
+    pair = np.fft.rfft(np.stack([v[begin : begin + size], v[again : again + size]]))
+    turn = 2 * np.pi * np.arange(pair.shape[1]) / size
+    inside = (turn > 2 * np.pi * PHASES[0]) & (turn < 2 * np.pi * PHASES[1])
+    turn, product = turn[inside], (np.conj(pair[0]) * pair[1])[inside]
+    phase = np.angle(product * np.exp(-1j * turn * (again - begin - (periods - 1) * spacing)))
+    weight = np.abs(product) * turn
+    total = weight @ turn
+    found = -(weight @ phase) / total
+    return float(found), float(np.linalg.norm(weight * (phase + found * turn)) / total)
 
 
 # --- Drift of one record against the other --------------------------------------------------------

@@ -1,8 +1,8 @@
-"""Quick looks at records: which may have mains hum, 1/f noise, disturbed or shifted periods.
+"""Quick looks at records: which may have mains hum, few codes, disturbed or shifted periods.
 
 Most records have none of these. A look is a few products or means of all samples; what it suspects
-is examined by `etid.signals.mains`, `etid.signals.noise` and `etid.signals.disturbances`. Records
-of equal length and rates are looked at together.
+is examined by `etid.signals.mains`, `etid.signals.rounding` and `etid.signals.disturbances`.
+Records of equal length and rates are looked at together.
 """
 
 import functools
@@ -50,22 +50,6 @@ def humming(
     return suspect
 
 
-def flickering(
-    records: Float[np.ndarray, "*record time"],
-    sigma: Float[np.ndarray, "*record"],
-    periods: int,
-    samples: int,
-) -> Bool[np.ndarray, "*record"]:
-    """Whether records may have 1/f noise; arguments as in `humming`.
-
-    Of all records with white noise, 5 % exceed the limit.
-    """
-    if periods < 2 or samples > PROBED:
-        return (sigma > 0) & (periods > 1)
-    size = np.abs(_products(records, _flicker_probes(periods, samples))).max(-1)
-    return (sigma > 0) & (size > 2.5 * sigma)
-
-
 def uneven(
     records: Float[np.ndarray, "recording 2 time"],
     sigma: Float[np.ndarray, "recording 2"],
@@ -88,6 +72,12 @@ def uneven(
     least, most = highest_beside(low), -highest_beside(-high)
     allowed = allowed_deviation(most, least, high.max(2), sigma, step)
     return ((high - low)[..., 1:-1] > allowed).any((1, 2)) | shifted
+
+
+def shows_few(v: Float[np.ndarray, "*record time"]) -> Bool[np.ndarray, "*record"]:
+    """Whether the first 256 samples have few values, as those of a converter without noise."""
+    first = np.sort(v[..., :256], axis=-1)
+    return np.asarray(np.count_nonzero(first[..., 1:] != first[..., :-1], axis=-1) < 128)
 
 
 def noise_limit(sigma: Float[np.ndarray, "recording 2"]) -> Float[np.ndarray, "recording 2"]:
@@ -209,10 +199,3 @@ def _hum_probes(
     # At 10 Hz all mains frequencies are harmonics: no bin is left, and the probes are 0.
     response = math.sqrt(2 * samples / max(bins.size, 1) * np.sum(left**2))
     return _mixtures(bins, np.arange(bins.size) % 4 >= 2, samples), response
-
-
-@functools.lru_cache(maxsize=8)
-def _flicker_probes(periods: int, samples: int) -> Float[np.ndarray, "probe time"]:
-    """`_mixtures` of the twelve lowest bins between the harmonics."""
-    low = [number for number in range(1, 24) if number % periods][:12]
-    return _mixtures(np.array(low), np.arange(len(low)) % 2 == 1, samples)

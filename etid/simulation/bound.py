@@ -32,7 +32,7 @@ from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.identify.arguments import require
 from etid.precision import in_float64
 from etid.signals.harmonics import whole_periods
-from etid.signals.noise import COARSE, is_coarse, rounding_variance
+from etid.signals.rounding import COARSE, is_coarse, rounding_variance
 from etid.simulation.scenes import Scene, Trial, Waveform
 from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
 from etid.solvers.matrices import inverse

@@ -13,6 +13,7 @@ from etid.estimators.estimator import (
     CHECKED,
     DETERMINED,
     HARMONICS,
+    NOISE_BY_FREQUENCY,
     AbstractEstimator,
     Description,
 )
@@ -65,6 +66,7 @@ def description(
         ),
         errors=BY_RESIDUALS,
         refined=True,
+        noise=NOISE_BY_FREQUENCY,
         cited=("pintelon2012", "optimistix2024", "white1980"),
     )
 

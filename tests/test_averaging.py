@@ -1,0 +1,82 @@
+"""Aliases of edges do not reach the averages, whatever the clock of the pulses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import etid
+from etid.recordings.group import Group
+from etid.signals.averaging import weighted, weights
+from etid.signals.harmonics import harmonics
+from etid.signals.pulse_train import late
+from tests.skins import off
+
+RATE, PULSES = 200e3, 60.0
+
+
+def sampled(spacing, samples, highest):
+    """Pulses with edges, and the same behind a filter of first order at 10 kHz; its gain.
+
+    Their harmonics go up to `highest` times the sample rate.
+    """
+    number = np.arange(1, int(highest * spacing))
+    size = np.sin(np.pi * 0.0413 * number) / (np.pi * number) * np.exp(-2j * np.pi * 0.3 * number)
+    size *= np.exp(-np.square(number / (0.6 * spacing)))  # edges of a sample, which do not ring
+    gain = 1 / (1 + 1j * number * PULSES / 10e3)
+    turn = np.exp(2j * np.pi * np.outer(np.arange(samples), number) / spacing)
+    return [2 * (turn @ of).real for of in (size, size * gain)], gain
+
+
+@pytest.mark.parametrize("ppm", [15.0, -15.0, 20.0])
+@pytest.mark.parametrize(("periods", "highest"), [(3, 1.0), (5, 1.4), (6, 1.4)])
+def test_the_weighted_mean_has_no_aliases(periods, highest, ppm):
+    spacing = RATE / PULSES * (1 + 1e-6 * ppm)
+    samples = round(periods * RATE / PULSES)
+    both, gain = sampled(spacing, samples, highest)
+    of_all = weighted(np.stack(both), spacing, weights(spacing % 1, periods))
+    errors = []
+    for x, y in (harmonics(np.stack(both), periods, samples), harmonics(of_all, periods, samples)):
+        loud = np.abs(x) > 0.3 * np.median(np.abs(x))
+        ratio = np.abs(y / x / gain[: x.size] - 1)
+        errors.append(np.median(ratio[100:600][loud[100:600]]))  # 6 to 36 kHz
+    # The rest is that of harmonics which are not exactly at the bins.
+    assert errors[1] < max(errors[0] / 4, 1e-4)
+
+
+@pytest.mark.parametrize("ppm", [0.0, 15.0, 50.0])
+def test_the_clock_is_known_to_a_hundredth_of_a_sample(ppm):
+    """Without a filter: aliases of the edges are a tenth of the spectrum at a tenth of the rate."""
+    scene = etid.scenes.paper_dry(antialias=3.5, snr_db=60.0, samples=20_000, pulse_rate_ppm=ppm)
+    scene = dataclasses.replace(scene, trials=scene.trials[:1])
+    one = scene.simulate(seed=0)[scene.trials[0].path]
+    edge = int(Group([one]).trains[0].edges[0])
+    found, error = late(np.asarray(one.v_th), edge, RATE / PULSES, 6)
+    assert found == pytest.approx(-5 * RATE / PULSES * 1e-6 * ppm, abs=0.01)
+    assert error < 0.01
+
+
+def test_weights_are_equal_where_the_clock_needs_no_others():
+    np.testing.assert_allclose(weights(1 / 3, 6), 1 / 6, atol=1e-12)
+    assert weights(0.0, 4) == pytest.approx([0.25] * 4)  # aliases cannot be told from the signal
+
+
+@pytest.mark.parametrize("kind", ["dry", "damp"])
+def test_a_converter_without_a_filter_and_a_clock_of_its_own(kind):
+    """Aliases leaked into the harmonics: damp skin was `inconsistent`, three of four."""
+    scene = getattr(etid.scenes, f"paper_{kind}")(
+        antialias=3.5,
+        snr_db=60.0,
+        samples=20_000,
+        pulse_rate_ppm=15.0,
+        trigger_jitter_rms=50e-9,
+    )
+    scene = dataclasses.replace(scene, trials=scene.trials[:3])
+    study = scene.simulate(seed=0)
+    driver = etid.identify_driver(study["calibration/98k8"])
+    fits = etid.identify_skins(study.loaded.recordings(), driver)
+    assert fits.counts() == {"successful": 3}
+    truth = scene.truth()[scene.trials[0].path]
+    for fit in fits:
+        assert (np.abs(off(fit, np.array(list(truth.values())))) < 4.0).all()
+        assert fit.chi2 < 1.15  # five standard deviations
