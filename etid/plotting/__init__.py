@@ -54,15 +54,16 @@ def plot(
     |---|---|---|
     | `plot(recording)` | V_th and V_out [V]: the whole record, and one pulse | 2 |
     | `plot(recording)` with a current | below them the current, over the same time | 4 |
-    | `plot(fit)` | one pulse measured and predicted [V]; residual [mV] | 2 |
+    | `plot(fit)` | one pulse measured and predicted [V]; residual [mV]; its spectrum | 3 |
+    | `plot(fit)` without whole periods or elements | the same without the spectrum | 2 |
     | `plot(fit, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
     | `plot(fit, show="residual")` | residual [mV], its correlations | 3 |
     | `plot(fit)` of `identify_impedance` | Nyquist and Bode: fit, measured | 3 |
     | `plot(fit.measured)` | Nyquist and Bode: measured | 3 |
-    | `plot(fits[0], recording, driver)` | as `plot(fit)`, for one of several fits | 2 |
-    | `plot(fits[0], recording)` | that for a fit from a measured current | 2 |
+    | `plot(fits[0], recording, driver)` | as `plot(fit)`, for one of several fits | 3 |
+    | `plot(fits[0], recording)` | that for a fit from a measured current | 3 |
     | `plot(selection, recording, driver)` | impedance measured, and each candidate | 4 |
-    | `plot(driver, calibration)` | as `plot(fit)`, for the resistor of a calibration | 2 |
+    | `plot(driver, calibration)` | as `plot(fit)`, for the resistor of a calibration | 3 |
     | `plot(driver)`, `plot(circuit)` | magnitude [kΩ] and phase [deg] of an impedance | 2 |
     | `plot({label: driver, fit or circuit})` | several of these in one diagram | 2 |
     | `plot(posterior)` | each element, and each two of them, beside the errors of the fit | n² |
@@ -72,11 +73,15 @@ def plot(
     | `plot(fits, map="r_p")` | an element at each electrode of a display | one per group |
     | `plot(etid.bound(scene))` | smallest relative standard errors [%] of each recording | 1 |
 
-    The band around the residual of a pulse is ±2σ of the noise of both records, σ² = σ_out² +
-    σ_th² mean |G|² with G = Z_L / (Z_L + Z_th). If only noise is left, 95 % of the residual lies
-    inside; aliases above 0.4 of the sample rate may exceed it at the edges. The bands around
-    impedances are two standard errors, from the covariance of the fit or driver. Fits and drivers
-    without success have a red title, and their points are hollow.
+    The band around the residual of a pulse is ±2σ of the noise of both records, the power
+    var V_out + |G|² var V_th of all frequencies with G = Z_L / (Z_L + Z_th). If only noise is left,
+    95 % of the residual lies inside; aliases above 0.4 of the sample rate may exceed it at the
+    edges. The spectrum of the residual [V/√Hz] has a point for each band of harmonics, pale if the
+    fit did not use them. Its line is the noise with which the fit weighted each harmonic, and 95 %
+    of the points lie in the band if only this noise is left. The legend says which noise it is.
+
+    The bands around impedances are two standard errors, from the covariance of the fit or driver.
+    Fits and drivers without success have a red title, and their points are hollow.
 
     The points of `show="impedance"` are what the recording measures in bands of frequency, with two
     standard errors. `show="residual"` adds the autocorrelation of the residual and its

@@ -15,19 +15,26 @@ free, and the parameters of Z_th move within their covariance.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
 import scipy
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import delay_width
+from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
+from etid.identify.arguments import fed
 from etid.numpy_tier.tiers import program
-from etid.results.driver import ContinuousDriver, SourceImpedance
-from etid.results.feed import MeasuredCurrent
+from etid.recordings.preflight import Inspected
+from etid.recordings.recording import Recording
+from etid.recordings.remarks import Remark
+from etid.results.driver import ContinuousDriver, Driver, SourceImpedance
+from etid.results.feed import AbstractFeed, MeasuredCurrent
 
 CLEAR = 0.3  # relative standard error up to which the impedance of a band is drawn as a clear point
 
@@ -49,6 +56,31 @@ class Bands:
     deviation: Float[np.ndarray, "2 band"]
 
 
+def continuous(
+    recording: Recording, driver: Driver | None
+) -> tuple[Recording, ContinuousDriver | MeasuredCurrent]:
+    """A recording and its feed, in continuous time.
+
+    Raises:
+        ValueError: The driver has no continuous source impedance.
+        RecordingError: The recording lacks what its feed needs.
+    """
+    recording, feed = fed(recording, driver)
+    if isinstance(feed, MeasuredCurrent):
+        return recording, feed
+    return recording, serving(feed, ContinuousDriver, MAXIMUM_LIKELIHOOD.name)
+
+
+def used(
+    seen: Inspected, feed: AbstractFeed, circuit: AbstractCircuit, remarks: Int[Any, ""]
+) -> Harmonics:
+    """Harmonics of a recording as a fit with these remarks used them."""
+    lane = Harmonics.of(seen)
+    lane = lane.realigned(lane.late_by(circuit, feed))
+    hums = int(remarks) & Remark.mains_hum
+    return (lane.without_mains() if hums else None) or lane
+
+
 def bands(
     lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
 ) -> Bands:
@@ -59,7 +91,7 @@ def bands(
         feed: Driver with its covariance, or the measured current.
         circuit: Fitted circuit.
     """
-    gain, turned, z_th = _fitted(lane, feed, circuit)
+    gain, turned, z_th = fitted(lane, feed, circuit)
     var = lane.variance_y + np.abs(turned) ** 2 * lane.variance_x
     x = (lane.variance_y * lane.x + lane.variance_x * np.conj(turned) * lane.y) / var
     by_load = np.ones_like(gain) if z_th is None else 1 - gain  # ∂ ln G/∂ ln Z
@@ -109,7 +141,7 @@ def _source(
     return z_th(values), jax.jacfwd(z_th)(values).T
 
 
-def _fitted(
+def fitted(
     lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
 ) -> tuple[
     Complex[np.ndarray, " harmonic"],
@@ -126,18 +158,22 @@ def _fitted(
     source, changes = None, np.zeros((0, z.size), complex)
     if not isinstance(feed, MeasuredCurrent):
         source, slopes = map(np.asarray, _source(feed.source, frequency))
-        size, vectors = np.linalg.eigh(np.asarray(feed.later_cov()))
+        cov = np.asarray(feed.later_cov())
+        if not np.isfinite(cov).all():  # a driver that failed is taken as it is
+            cov = np.zeros_like(cov)
+        size, vectors = np.linalg.eigh(cov)
         changes = (vectors * np.sqrt(np.maximum(size, 0.0))).T @ slopes
     instrument = None if isinstance(feed, MeasuredCurrent) else feed.instrument
     width = np.asarray(delay_width(instrument, jax.device_put(np.asarray(lane.sample_rate))))
-    deviations = np.append(width, np.ones(len(changes)))
+    deviations, start = np.append(width, np.ones(len(changes))), np.zeros(1 + len(changes))
 
     def at(p: Float[np.ndarray, " parameter"]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         z_th = None if source is None else source + p[1:] @ changes
         gain = z if z_th is None else z / (z + z_th)
         return gain, gain * np.exp(-1j * p[0] * turn), z_th
 
-    start = np.zeros(deviations.size)
+    if not np.isfinite(at(start)[0]).all():
+        return at(start)
     variance = lane.variance_y + np.abs(at(start)[0]) ** 2 * lane.variance_x
     scale = np.where(lane.selected, np.sqrt(2 / variance), 0.0)
 

@@ -8,12 +8,9 @@ from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from etid.estimators.estimator import serving
-from etid.estimators.lanes import Harmonics
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
-from etid.plotting.bands import CLEAR, Bands, bands
+from etid.plotting.bands import CLEAR, Bands, bands, continuous, used
 from etid.plotting.impedances import POINTS, curve, frame, points
 from etid.plotting.style import (
     BLUE,
@@ -32,10 +29,8 @@ from etid.plotting.style import (
 )
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
-from etid.recordings.remarks import Remark
 from etid.results.data import MeasuredImpedance
-from etid.results.driver import ContinuousDriver, Driver
-from etid.results.feed import MeasuredCurrent
+from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.selection.selection import Candidate, Selection
 
@@ -46,8 +41,9 @@ def draw_impedance(
     """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
     if not listed(fit):
         return _empty(canvas, fit, recording.path)
-    recording, known = _in_bands(recording, driver)
-    measured = bands(Harmonics.of(Inspected(recording)), known, fit.circuit)
+    recording, known = continuous(recording, driver)
+    lane = used(Inspected(recording), known, fit.circuit, fit.remarks)
+    measured = bands(lane, known, fit.circuit)
     clear = measured.stderr <= CLEAR
     points = measured.frequency[clear], measured.z[clear], measured.stderr[clear]
     return _diagrams(canvas, fit, recording.path, *points)
@@ -98,21 +94,6 @@ def _diagrams(
     magnitude.xaxis.set_major_formatter("{x:g}")
     legend(axes)
     return axes
-
-
-def _in_bands(
-    recording: Recording, driver: Driver | None
-) -> tuple[Recording, ContinuousDriver | MeasuredCurrent]:
-    """A recording and its feed, for the impedance that it measures.
-
-    Raises:
-        ValueError: The driver has no continuous source impedance.
-        RecordingError: The recording lacks what its feed needs.
-    """
-    recording, feed = fed(recording, driver)
-    if isinstance(feed, MeasuredCurrent):
-        return recording, feed
-    return recording, serving(feed, ContinuousDriver, MAXIMUM_LIKELIHOOD.name)
 
 
 def draw_residual(
@@ -174,11 +155,8 @@ def draw_selection(
             without_elements(axis)
         judged(axes[0], recording.path, selection.fit)
         return axes
-    recording, known = _in_bands(recording, driver)
-    lane = Harmonics.of(Inspected(recording))
-    lane = lane.realigned(lane.late_by(chosen.fit.circuit, known))
-    if int(chosen.fit.remarks) & Remark.mains_hum:
-        lane = lane.without_mains() or lane
+    recording, known = continuous(recording, driver)
+    lane = used(Inspected(recording), known, chosen.fit.circuit, chosen.fit.remarks)
     found = [bands(lane, known, one.fit.circuit) for one in fitted]
     _measured_and_fitted(axes[0], axes[1], fitted, found[0])
     _deviations(axes[2], axes[3], found)

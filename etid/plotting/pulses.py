@@ -1,12 +1,13 @@
 """Pictures over time: a record, one pulse, and the residual of a predicted pulse."""
 
-import jax
 import numpy as np
+from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.circuits.display import heading, scaled
-from etid.identify.arguments import fed
 from etid.identify.predict import predict
+from etid.plotting.bands import continuous
+from etid.plotting.by_frequency import by_frequency, draw_by_frequency, sample_std
 from etid.plotting.style import (
     BLUE,
     INK,
@@ -22,10 +23,10 @@ from etid.plotting.style import (
     without_elements,
 )
 from etid.recordings.fields import LABELS
+from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.fit import Fit
-from etid.signals.noise import noise
 
 
 def pulse(recording: Recording) -> slice:
@@ -79,7 +80,7 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
 def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None) -> np.ndarray:
     """Measured and predicted pulse, the residual, and the verdict of the fit as title."""
     elements = listed(fit)
-    axes = _pulse_and_residual(canvas, recording, driver, fit.circuit if elements else None)
+    axes = _pulse_and_residual(canvas, fit, recording, driver, fit.circuit if elements else None)
     judged(axes[0], recording.path, fit, *elements)
     return axes
 
@@ -91,60 +92,74 @@ def draw_calibration(canvas: Canvas, driver: Driver, recording: Recording) -> np
             "a driver is drawn with a calibration, but this recording has no r_load; draw the "
             "fit of this recording, plot(fit, recording, driver)"
         )
-    axes = _pulse_and_residual(canvas, recording, driver, Resistor(recording.r_load))
+    load = Resistor(recording.r_load)
+    axes = _pulse_and_residual(canvas, driver, recording, driver, load)
     about = f"driver of order {driver.order}, known load {recording.r_load / 1e3:g} kΩ"
     judged(axes[0], recording.path, driver, about)
     return axes
 
 
 def _pulse_and_residual(
-    canvas: Canvas, recording: Recording, driver: Driver | None, load: AbstractCircuit | None
+    canvas: Canvas,
+    found: Fit | Driver,
+    recording: Recording,
+    driver: Driver | None,
+    load: AbstractCircuit | None,
 ) -> np.ndarray:
-    """One pulse, measured and predicted, and the residual with ±2σ of the noise.
+    """One pulse, measured and predicted, and the residual in time and by frequency.
 
-    Without a load nothing is predicted.
+    A record of no whole periods, or with a missing sample, has no harmonics to show. Without a load
+    nothing is predicted.
     """
-    ratios = {"height_ratios": [3, 1.2]}
-    upper, lower = axes = canvas(2, 1, (6.0, 4.8), sharex=True, gridspec_kw=ratios).ravel()
+    if load is None:
+        axes = _panels(canvas, 2)
+        _draw_measured(axes, recording)
+        without_elements(axes[1], "no elements, nothing predicted")
+        legend(axes, axes[0].get_legend_handles_labels()[0])
+        return axes
+    predicted = predict(recording, driver, load)
+    of, feed = continuous(recording, driver)
+    seen = Inspected(of)
+    axes = _panels(canvas, 3 if seen.is_periodic and np.isfinite(seen.spans).all() else 2)
+    part, time = _draw_measured(axes, recording)
+    upper, lower = axes[:2]
+    upper.plot(time, predicted[part], "--", color=ORANGE, lw=1.2, label="predicted")
+    sigma = 1e3 * sample_std(seen, feed, load)
+    # Above 0.4 of the sample rate, aliases of the edges are neither noise nor predicted.
+    label = "95 % of the noise (edges: aliases)"
+    lower.axhspan(-2 * sigma, 2 * sigma, color="0.85", lw=0, label=label)
+    lower.axhline(0.0, color="0.6", lw=0.6)
+    lower.plot(time, 1e3 * (predicted - recording.v_out)[part], color=BLUE, lw=0.8)
+    for axis in axes[2:]:
+        if np.isfinite(sigma):
+            draw_by_frequency(axis, by_frequency(seen, feed, load, found))
+        else:
+            without_elements(axis, "nothing predicted")
+    legend(axes, [one for axis in axes for one in axis.get_legend_handles_labels()[0]])
+    return axes
+
+
+def _panels(canvas: Canvas, count: int) -> np.ndarray:
+    """Two panels over one time, and one over frequency if there are three."""
+    height, *ratios = {2: (4.8, 3, 1.2), 3: (6.6, 2.6, 1.2, 1.7)}[count]
+    axes = canvas(count, 1, (6.0, height), gridspec_kw={"height_ratios": ratios}).ravel()
+    if canvas.axes is None:
+        axes[0].sharex(axes[1])
+        axes[0].tick_params(labelbottom=False)
+    return axes
+
+
+def _draw_measured(
+    axes: np.ndarray, recording: Recording
+) -> tuple[slice, Float[np.ndarray, " time"]]:
+    """Draw one pulse as it was measured; its samples and their time [ms]."""
     part = pulse(recording)
     time = 1e3 * recording.time[part]
+    upper, lower = axes[:2]
     if recording.cause == "v_th":
         upper.plot(time, recording.v_th[part], ":", color="0.55", lw=1.0, label=typeset("V_th"))
     measured = typeset("V_out measured")
     upper.plot(time, recording.v_out[part], color=INK, lw=1.4, label=measured)
     upper.set(ylabel="voltage [V]")
     lower.set(xlabel="time [ms]", ylabel="residual [mV]")
-    if load is None:
-        without_elements(lower, "no elements, nothing predicted")
-    else:
-        predicted = predict(recording, driver, load)
-        upper.plot(time, predicted[part], "--", color=ORANGE, lw=1.2, label="predicted")
-        sigma = 1e3 * residual_std(recording, driver, load)
-        # Above 0.4 of the sample rate, aliases of the edges are neither noise nor predicted.
-        label = r"$\pm2\,\sigma$ of the noise (edges: aliases)"
-        lower.axhspan(-2 * sigma, 2 * sigma, color="0.85", lw=0, label=label)
-        lower.axhline(0.0, color="0.6", lw=0.6)
-        lower.plot(time, 1e3 * (predicted - recording.v_out)[part], color=BLUE, lw=0.8)
-    legend(axes, [one for axis in axes for one in axis.get_legend_handles_labels()[0]])
-    return axes
-
-
-def residual_std(recording: Recording, driver: Driver | None, circuit: AbstractCircuit) -> float:
-    """Standard deviation of predicted − measured voltage if only noise is left [V].
-
-    The noise of V_th reaches the residual through the loaded driver G = Z_L / (Z_L + Z_th), that of
-    a measured current through G = Z_L,
-
-        σ² = σ_out² + σ_th² mean |G|²,    the mean from 0 to half the sample rate (Parseval).
-    """
-    half = recording.sample_rate / 2
-    # Features of G are wider than a thousandth of the band.
-    frequency = jax.device_put((np.arange(2048) + 0.5) * half / 2048)
-    recording, feed = fed(recording, driver)
-    size = np.abs(np.asarray(feed.gain(circuit.response(frequency), frequency)))
-    gain = np.mean(size**2)
-    both = (recording.samples[name] for name in (recording.cause, "v_out"))
-    sigma_th, sigma_out = (
-        float(noise(one.values, np.asarray(one.resolution or 0.0))) for one in both
-    )
-    return float(np.sqrt(sigma_out**2 + sigma_th**2 * gain))
+    return part, time

@@ -235,14 +235,18 @@ def drawable(values: np.ndarray) -> np.ndarray:
     return (values > 1e-100) & (values < 1e100)
 
 
-def plain_ticks(axis: Axis) -> None:
+def plain_ticks(axis: Axis, short: float = 1e3) -> None:
     """Plain numbers on a logarithmic axis with limits: 10, 20, 50 if it is short, else 0.1, 1, 10.
 
     An axis of more than six decades keeps its powers of ten.
+
+    Args:
+        axis: The axis.
+        short: Upper over lower limit of the longest axis with 20 and 50.
     """
     low, high = sorted(axis.get_view_interval())
     if 0 < low and high < 1e6 * low:
-        steps = LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,))
+        steps = LogLocator(subs=(1.0, 2.0, 5.0) if high < short * low else (1.0,))
         few = sum(low <= tick <= high for tick in steps.tick_values(low, high)) < 2
         axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]) if few else steps)
         axis.set_major_formatter("{x:g}")

@@ -1,0 +1,162 @@
+"""The residual of a fit by frequency, beside the noise that the fit expects there.
+
+The coefficient of a record of T seconds at one harmonic is noise of a band of 1/T. Its E|noise|² is
+half of the power in this band, so that the one-sided density is
+
+    √(2 T E|noise|²)   [V/√Hz].
+
+The residual is e = Y − G X, in the same unit, and E|e|² = var Y + |G|² var X are the weights of the
+likelihood. The mean of |e|² over n harmonics of noise has the gamma distribution with the shape n.
+"""
+
+import dataclasses
+
+import jax
+import numpy as np
+import scipy.special
+from jaxtyping import Bool, Float, Int
+from matplotlib.axes import Axes
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import PREFIXES, several
+from etid.estimators.lanes import Harmonics
+from etid.estimators.registry import named
+from etid.identify.options import for_calibrations
+from etid.plotting.bands import fitted, used
+from etid.plotting.style import BLUE, INK, plain_ticks
+from etid.recordings.preflight import Inspected
+from etid.results.driver import ContinuousDriver, Driver
+from etid.results.feed import AbstractFeed, MeasuredCurrent
+from etid.results.fit import Fit
+from etid.results.fits import AND
+
+PER_DECADE = 10  # bands
+FEWEST = 4  # harmonics of a band at least: their mean is known to 50 %
+
+
+@dataclasses.dataclass(frozen=True)
+class ByFrequency:
+    """The residual and the noise of a fit at the harmonics of its recording.
+
+    Attributes:
+        frequency: The harmonics [Hz].
+        residual: |Y − G X| of each, as a density [V/√Hz].
+        noise: What the fit expects of each, as a density [V/√Hz].
+        selected: Harmonics that the fit used.
+        which: The noise in words.
+    """
+
+    frequency: Float[np.ndarray, " harmonic"]
+    residual: Float[np.ndarray, " harmonic"]
+    noise: Float[np.ndarray, " harmonic"]
+    selected: Bool[np.ndarray, " harmonic"]
+    which: str
+
+
+def in_time(seen: Inspected, found: Fit | Driver) -> bool:
+    """Whether samples of a recording were fitted, whose noise is taken for white."""
+    method = str(found.method)
+    if AND in method:  # of a batch, where etid chose the method of each recording
+        method = str(for_calibrations(None, [seen]))
+    try:
+        return not named(method).lane.periodic
+    except ValueError:  # joint fits and others, all at harmonics
+        return False
+
+
+def by_frequency(
+    seen: Inspected,
+    feed: ContinuousDriver | MeasuredCurrent,
+    circuit: AbstractCircuit,
+    found: Fit | Driver,
+) -> ByFrequency:
+    """The residual and the noise of a recording of whole periods.
+
+    Args:
+        seen: The recording.
+        feed: Its driver, or the measured current.
+        circuit: The load.
+        found: The fit, or the driver that was identified with a known load.
+    """
+    lane = used(seen, feed, circuit, found.remarks)
+    size = seen.noise.power.shape[-1]  # padded harmonics follow
+    lane = Harmonics(*(of[:size] if np.ndim(of) else of for of in jax.tree.leaves(lane)))
+    samples = seen.periods[1]
+    if in_time(seen, found):
+        white = np.square(seen.trusted) / samples
+        lane = dataclasses.replace(
+            lane, variance_x=np.full(size, white[0]), variance_y=np.full(size, white[1])
+        )
+    _, gain, _ = fitted(lane, feed, circuit)
+    power = np.square(np.abs(lane.y - gain * lane.x))
+    expected = lane.variance_y + np.square(np.abs(gain)) * lane.variance_x
+    residual, noise = np.sqrt(2 * samples / lane.sample_rate * np.stack([power, expected]))
+    at, selected = map(np.asarray, (lane.frequency, lane.selected))
+    return ByFrequency(at, residual, noise, selected, _which(seen, found))
+
+
+def _which(seen: Inspected, found: Fit | Driver) -> str:
+    """The noise in words: by what it was measured, or white."""
+    bins = int(seen.noise.bins.min())
+    if in_time(seen, found) or bins == 0:
+        return "white noise"
+    where = "between the harmonics" if seen.periods[0] > 1 else "in the quiet part"
+    return f"noise {where} ({several(bins, 'bin')})"
+
+
+def sample_std(seen: Inspected, feed: AbstractFeed, circuit: AbstractCircuit) -> float:
+    """Standard deviation of predicted − measured voltage if only noise is left [V].
+
+    The noise of V_th reaches the residual through the loaded driver G = Z_L / (Z_L + Z_th), that of
+    a measured current through G = Z_L. The powers of all bins are summed (Parseval),
+
+        σ² = 2 P Σ (E|noise of Y|² + |G|² E|noise of X|²)
+
+    over the harmonics, each of which stands for the P bins around it.
+    """
+    of_th, of_out = seen.noise.of_each
+    periods = max(seen.periods[0], 1)
+    samples = seen.periods[1] if seen.periods[0] else seen.v_out.size
+    harmonic = np.arange(1.0, of_out.size + 1)
+    frequency = jax.device_put(harmonic * (periods * seen.recording.sample_rate / samples))
+    gain = np.abs(np.asarray(feed.gain(circuit.response(frequency), frequency)))
+    return float(np.sqrt(2 * periods * np.sum(of_out + gain**2 * of_th)))
+
+
+def band_of(count: int) -> Int[np.ndarray, " harmonic"]:
+    """Number of the band of each harmonic."""
+    edges = [0]
+    while edges[-1] < count:
+        edges.append(max(edges[-1] + FEWEST, round(edges[-1] * 10 ** (1 / PER_DECADE))))
+    return np.searchsorted(edges, np.arange(count), side="right") - 1
+
+
+def draw_by_frequency(axis: Axes, found: ByFrequency) -> None:
+    """Residual in bands, the noise that the fit expects, and where 95 % of such noise lies.
+
+    Harmonics that the fit did not use are pale, and no noise is expected there.
+    """
+    band, used = band_of(found.frequency.size), found.selected
+    power = int(np.clip(3 * np.floor(np.log10(np.median(found.noise[used])) / 3), -15, 0))
+    unit = 10.0**power
+
+    def mean(values: Float[np.ndarray, " harmonic"]) -> Float[np.ndarray, " band"]:
+        sums = np.bincount(band, np.where(some, values, 0.0))
+        return sums[number > 0] / number[number > 0]
+
+    for some, alpha in ((~used, 0.3), (used, 1.0)):
+        number = np.bincount(band, some)
+        at = np.exp(mean(np.log(found.frequency))) / 1e3
+        size = np.sqrt(mean(found.residual**2)) / unit
+        axis.plot(at, size, "o", ms=3.5, color=BLUE, alpha=alpha, zorder=3)
+    shape, expected = number[number > 0], np.sqrt(mean(found.noise**2)) / unit
+    low, high = (np.sqrt(scipy.special.gammaincinv(shape, p) / shape) for p in (0.025, 0.975))
+    axis.fill_between(at, low * expected, high * expected, color="0.85", lw=0)
+    noise = found.noise[used] / unit
+    axis.plot(found.frequency[used] / 1e3, noise, color=INK, lw=1.1, label=found.which)
+    axis.set(xscale="log", yscale="log", xlabel="frequency [kHz]")
+    axis.set(ylabel=f"residual [{PREFIXES[power]}V/√Hz]")
+    bottom, top = axis.get_ylim()
+    axis.set_ylim(min(bottom, noise.min() / 4), max(top, noise.max() * 4))  # else noise looks large
+    plain_ticks(axis.xaxis)
+    plain_ticks(axis.yaxis, short=50.0)  # the panel is low
