@@ -271,10 +271,9 @@ def _aliased(group: Sequence[Inspected], layout: Bands) -> Bool[np.ndarray, "lan
     """
     found = []
     for one in group:
-        frequency, _, y, _, variance, _ = one.spectrum
-        angle = frequency * (2 * np.pi / one.recording.sample_rate)
-        ratio = aliases(y, variance, *one.periods).power / variance
-        found.append(np.interp(layout.middle, angle, ratio) * layout.number > 0.1)
+        _, _, y, _, variance, _ = one.spectrum
+        ratio = np.asarray(aliases(y, variance, *one.periods).power / variance)
+        found.append(_in_bands(one, layout, ratio) * layout.number > 0.1)
     return np.stack(found) | (layout.middle > 2 * np.pi * ALIASES)
 
 
@@ -284,11 +283,18 @@ def _noise(
     """Variance of the real part of a harmonic of one period, in each band of one of the records."""
     found = []
     for one in group:
-        frequency, *_, variance_x, variance_y, _ = one.spectrum
-        angle = frequency * (2 * np.pi / one.recording.sample_rate)
-        variance = np.interp(layout.middle, angle, (variance_x, variance_y)[record])
+        *_, variance_x, variance_y, _ = one.spectrum
+        variance = _in_bands(one, layout, (variance_x, variance_y)[record])
         found.append(variance * one.periods[1] * (layout.length / 2))
     return np.stack(found)
+
+
+def _in_bands(
+    one: Inspected, layout: Bands, values: Float[np.ndarray, " harmonic"]
+) -> Float[np.ndarray, " band"]:
+    """Values at the harmonics of a recording, at the centre of each band."""
+    angle = one.spectrum[0] * (2 * np.pi / one.recording.sample_rate)
+    return np.interp(layout.middle, angle, values)
 
 
 class _Deviations(NamedTuple):

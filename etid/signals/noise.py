@@ -22,7 +22,7 @@ the finest wavelet coefficients in the same way). The median ignores the few per
 the edges. This serves a single period without a quiet part. A tone at 0.18 of the sample rate
 passes these differences with a twentieth of its size. In a record whose differences do not change
 their sign as often as those of white noise, the top of the band shows the noise too. The smaller
-noise is taken (`quietest`).
+noise is taken (`_quietest`).
 
 The noise of a converter is at least resolution/√12.
 """

@@ -3,9 +3,9 @@
 At every harmonic the records are an input X and outputs G_m e^(−jωτ_m) X: V_out of the trial with
 G = Z_L / (Z_L + Z_th), the current with 1 / (Z_L + Z_th) if it is recorded, and V_out of each
 calibration. All records have the noise of the scene, which is white or has passed its filter. The
-rounding error of a coarse converter is not white (`etid.signals.noise`): where the signal is slow,
-it is the same in each period. X and
-Z_th are unknown complex numbers at every harmonic, so the bound holds for every kind of driver.
+rounding error of a coarse converter is not white (`etid.signals.rounding`): where the signal is
+slow, it is the same in each period. X and Z_th are unknown complex numbers at every harmonic, so
+the bound holds for every kind of driver.
 Without a calibration V_th tells nothing about the load, and the bound is that of the input I and
 the output Z_L e^(−jωτ) I. The information about the gains is (Pintelon and Schoukens, System
 Identification, 2012, ch. 9 and 16; `etid.estimators.maximum_likelihood.profile`)

@@ -390,7 +390,7 @@ class Scene(Overviewed):
         volts = self.scale * sampler.sample(coefficients, self.samples, self.start + delay)
         volts += offset
         if self.electronics is None:
-            volts += sigma * rng.standard_normal(self.samples)
+            volts += self._noise(rng, sigma, (self.samples,))
         else:
             corner = self.antialias * self.sample_rate
             volts = self.electronics.measured(
