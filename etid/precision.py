@@ -2,19 +2,33 @@
 
 Precision is float64. NaN and infinity are results here: elements of a fit that failed have no
 number, and its verdict says why. So `jax_debug_nans` and `jax_debug_infs` do not look into etid.
+
+Formulas compute in the namespace of their arrays, NumPy or JAX.
 """
 
 import functools
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.core
+import jax.numpy as jnp
 import numpy as np
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
+
+_NUMPY = (np.ndarray, np.generic, float, int, complex)
+
+
+def namespace(*values: Any) -> ModuleType:
+    """NumPy for arrays of NumPy and numbers, so that nothing is traced; JAX if one is another."""
+    for one in values:
+        if not isinstance(one, _NUMPY):
+            return jnp
+    return np
 
 
 def in_float64(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

@@ -27,18 +27,15 @@ of the variance n |A|². This variance adds to that of the noise.
 
 import functools
 import math
-from types import ModuleType
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.precision import Module
-from etid.signals.transfer import power
-
-Values = TypeVar("Values", Array, np.ndarray)
+from etid.precision import Module, namespace
+from etid.signals.transfer import Values, power
 
 WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate; above, aliases matter unless they fall between the harmonics
@@ -127,11 +124,6 @@ def harmonics(
     if xp is np:  # real and imaginary parts are real products
         return at_harmonics - np.einsum("...d,dh->...h", drift, basis.view(float)).view(complex)
     return at_harmonics - jnp.einsum("...d,dh->...h", drift.astype(basis.dtype), basis)
-
-
-def namespace(v: Array | np.ndarray) -> ModuleType:
-    """NumPy for NumPy arrays, so that nothing is compiled for each shape; JAX for all others."""
-    return np if isinstance(v, np.ndarray) else jnp
 
 
 def real_parts(values: Values) -> Values:

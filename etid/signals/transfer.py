@@ -4,16 +4,24 @@ Coefficients are stored in *ascending* powers of the variable. In z⁻¹ this is
 and `a`; in s it is the reverse of `scipy.signal`. Polynomials are multiplied with shifts, not with
 `jnp.convolve`: under `vmap` it becomes a grouped convolution over all lanes, so that a NaN in one
 lane spoils the others.
+
+The functions of numbers at frequencies compute in the namespace of their arrays: arrays of NumPy
+give arrays of NumPy, and nothing is traced.
 """
 
 import math
+from types import ModuleType
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Inexact
 
-from etid.precision import Module
+from etid.precision import Module, namespace
+
+AnyArray = Any  # of NumPy or JAX; a result has the namespace of the arguments
+Values = TypeVar("Values", Array, np.ndarray)
 
 
 def multiply_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[Array, " pq"]:
@@ -31,32 +39,53 @@ def add_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[Array
     return jnp.pad(p, (0, length - p.shape[0])) + jnp.pad(q, (0, length - q.shape[0]))
 
 
-def as_complex(x: Inexact[Array, "..."]) -> Complex[Array, "..."]:
+def as_complex(x: Inexact[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
     """The same numbers with a complex type; works with JAX's strict type promotion too."""
-    return jax.lax.convert_element_type(x, np.result_type(x.dtype, np.complex64))
+    kind = np.result_type(x.dtype, np.complex64)
+    if namespace(x) is np:
+        return x.astype(kind, copy=False)
+    return jax.lax.convert_element_type(x, kind)
 
 
-def power(z: Complex[Array, "..."]) -> Float[Array, "..."]:
+def from_parts(
+    real: Float[AnyArray, "..."], imaginary: Float[AnyArray, "..."]
+) -> Complex[AnyArray, "..."]:
+    """The complex numbers with these parts, which have one shape."""
+    if namespace(real, imaginary) is np:
+        z = np.empty(np.shape(real), np.result_type(real, np.complex64))
+        z.real, z.imag = real, imaginary
+        return z
+    return jax.lax.complex(real, imaginary)
+
+
+def power(z: Complex[AnyArray, "..."]) -> Float[AnyArray, "..."]:
     """|z|²."""
+    if namespace(z) is np:
+        return z.real**2 + z.imag**2
     # These functions are in all formulas. Operations of `lax` are traced in a third of the time.
     real, imag = jax.lax.real(z), jax.lax.imag(z)
     return jax.lax.add(jax.lax.mul(real, real), jax.lax.mul(imag, imag))
 
 
-def reciprocal(z: Complex[Array, "..."]) -> Complex[Array, "..."]:
+def reciprocal(z: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
     """1/z, for |z| between 1e-150 and 1e150.
 
-    Complex division guards against overflow. The guard costs thirty times the division itself.
+    XLA's complex division guards against overflow. The guard costs thirty times the division
+    itself.
     """
+    if namespace(z) is np:
+        return np.reciprocal(z)
     scale = jax.lax.integer_pow(power(z), -1)
     real, imag = jax.lax.mul(jax.lax.real(z), scale), jax.lax.mul(jax.lax.imag(z), scale)
     return jax.lax.complex(real, jax.lax.neg(imag))
 
 
 def combined(
-    z: Float[Array, "*row z"], slope: Complex[Array, "z harmonic"]
-) -> Complex[Array, "*row harmonic"]:
+    z: Float[AnyArray, "*row z"], slope: Complex[AnyArray, "z harmonic"]
+) -> Complex[AnyArray, "*row harmonic"]:
     """Σ z ∂/∂z, in real arithmetic, because complex matrix products take ten times as long."""
+    if namespace(z, slope) is np:  # real and imaginary parts are columns of one product
+        return (z @ np.ascontiguousarray(slope).view(slope.real.dtype)).view(slope.dtype)
     return jax.lax.complex(z @ slope.real, z @ slope.imag)
 
 
@@ -90,35 +119,56 @@ class Rational(Module):
         return Rational(self.den, self.num)
 
 
-def frequency_variable(frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+def frequency_variable(frequency: Float[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
     """The variable s = j 2π f [rad/s] at real frequencies [Hz]."""
-    return jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
+    if namespace(frequency) is np:
+        return 2j * np.pi * np.asarray(frequency)
+    return jax.lax.complex(jnp.zeros_like(frequency), 2 * np.pi * frequency)
 
 
 def delayed(
-    value: Complex[Array, "..."],
-    frequency: Float[Array, "..."],
-    delay_samples: Float[Array, ""],
-    sample_rate: Float[Array, ""],
-) -> Complex[Array, "..."]:
-    """`value` · e^(−j 2π f τ) at real frequencies [Hz], for a delay τ in samples."""
-    turn = -2 * jnp.pi * frequency * (delay_samples / sample_rate)
+    value: Complex[AnyArray, "*row harmonic"],
+    frequency: Float[AnyArray, "*#row harmonic"],
+    delay_samples: Float[AnyArray, "*#row"] | float,
+    sample_rate: Float[AnyArray, "*#row"] | float,
+) -> Complex[AnyArray, "*row harmonic"]:
+    """`value` · e^(−j 2π f τ) at frequencies [Hz], for a delay τ in samples, or one per row."""
+    xp = namespace(value, frequency, delay_samples, sample_rate)
+    late = _by_row(xp, delay_samples / sample_rate)
+    turn = -2 * np.pi * widened(frequency, np.ndim(late)) * late
+    if xp is np:
+        return value * from_parts(np.cos(turn), np.sin(turn))
     return value * jax.lax.complex(jax.lax.cos(turn), jax.lax.sin(turn))
 
 
-def turns(cycles: Float[Array, ""], count: int) -> Complex[Array, " harmonic"]:
-    """e^{j2πkc} for k = 1 … count, as products of about 2 √count sines and cosines.
+def turns(cycles: Float[AnyArray, "*row"], count: int) -> Complex[AnyArray, "*row harmonic"]:
+    """e^{j2πkc} for k = 1 … count along a last axis, as products of about 2 √count sines.
 
     A sine costs as much as the rest of the computation.
     """
-    side = math.isqrt(count) + 1
-    fine = 2 * jnp.pi * cycles * np.arange(1.0, side + 1)
-    coarse = 2 * jnp.pi * cycles * side * np.arange(1.0 * side)
-    left = jnp.stack([jax.lax.cos(coarse), jax.lax.sin(coarse)], axis=1)
+    xp, side = namespace(cycles), math.isqrt(count) + 1
+    each = 2 * np.pi * _by_row(xp, cycles)
+    first, steps = (widened(np.arange(start, side + start), each.ndim) for start in (1.0, 0.0))
+    fine, coarse = each * first, each * side * steps
+    if xp is np:
+        left, right = (from_parts(np.cos(of), np.sin(of)) for of in (coarse, fine))
+        return (left[..., :, None] * right[..., None, :]).reshape(*cycles.shape, -1)[..., :count]
+    left = jnp.stack([jax.lax.cos(coarse), jax.lax.sin(coarse)], axis=-1)
     c, s = jax.lax.cos(fine), jax.lax.sin(fine)
     # A matrix product, because XLA would move sines back into the loop over all harmonics.
-    real, imaginary = left @ jnp.stack([c, -s]), left @ jnp.stack([s, c])
-    return jax.lax.complex(real.reshape(-1)[:count], imaginary.reshape(-1)[:count])
+    parts = (left @ jnp.stack(one, axis=-2) for one in ([c, -s], [s, c]))
+    return jax.lax.complex(*(of.reshape(*cycles.shape, -1)[..., :count] for of in parts))
+
+
+def widened(values: Inexact[AnyArray, "..."], axes: int) -> Inexact[AnyArray, "..."]:
+    """The values with so many axes at least, for JAX: it may be told to add none by itself."""
+    more = axes - values.ndim
+    return values.reshape(*[1] * more, *values.shape) if more > 0 else values
+
+
+def _by_row(xp: ModuleType, value: Any) -> Any:
+    """One number as it is, those of rows with an axis for their harmonics."""
+    return xp.expand_dims(value, -1) if np.ndim(value) else value
 
 
 def delay_variable(
