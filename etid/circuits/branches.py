@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, impedance_at
 from etid.circuits.impedance import AbstractConnection, AbstractImpedance
-from etid.numpy_tier.tiers import program
 
 # Places of the elements of a branch. In two branches that can be exchanged, those with the same
 # number correspond.
@@ -65,7 +64,7 @@ def exchangeable(kind: type[AbstractCircuit]) -> tuple[tuple[Branch, ...], ...]:
     # Inside of a trace, too, these are numbers.
     with jax.ensure_compile_time_eval(), jax.enable_x64(True):
         typical = kind()
-        logs = np.log(np.array([float(np.asarray(getattr(typical, n))) for n in kind.names()]))
+        logs = np.log(typical.values())
         found = []
         for parts in _connections(kind, logs):
             sets: list[list[Branch]] = []
@@ -139,14 +138,8 @@ def _connections(kind: type[AbstractCircuit], logs: np.ndarray) -> Iterator[list
     yield from walk(*(_parts(tree) or [tree] for tree in trees))
 
 
-@program
-def _tree(kind: type[AbstractCircuit], logs: Any) -> AbstractImpedance:
-    return kind().with_values(jnp.exp(logs)).impedance()
-
-
-@program
-def _response(kind: type[AbstractCircuit], logs: Any, s: Any) -> Any:
-    return kind().with_values(jnp.exp(logs)).impedance()(s)
+def _tree(kind: type[AbstractCircuit], logs: np.ndarray) -> AbstractImpedance:
+    return kind().with_log_values(logs).impedance()
 
 
 def _parts(of: AbstractImpedance) -> list[AbstractImpedance]:
@@ -186,10 +179,10 @@ def _is_same(
     kind: type[AbstractCircuit], logs: np.ndarray, change: Callable[[np.ndarray], np.ndarray]
 ) -> bool:
     """Whether a change of the elements leaves the impedance as it is, whatever they are."""
-    s, random = 2j * np.pi * np.geomspace(1.0, 1e7, 15), np.random.default_rng(0)
+    frequency, random = np.geomspace(1.0, 1e7, 15), np.random.default_rng(0)
     for _ in range(2):
         drawn = logs + 0.3 * random.standard_normal(logs.size)
-        z, changed = (np.asarray(_response(kind, of, s)) for of in (drawn, change(drawn)))
+        z, changed = (impedance_at(kind(), of, frequency) for of in (drawn, change(drawn)))
         if not np.allclose(z, changed, rtol=EQUAL, atol=0.0):
             return False
     return True

@@ -9,7 +9,8 @@ and netlist.
 import abc
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from types import ModuleType
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
@@ -32,13 +33,14 @@ from etid.circuits.elements import (
 )
 from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
 from etid.circuits.overview import Overview, Overviewed, element_rows
-from etid.numpy_tier.tiers import in_numpy, program
-from etid.precision import Module
-from etid.signals.harmonics import namespace
+from etid.numpy_tier.tiers import program
+from etid.precision import Module, in_float64, namespace
 from etid.signals.missing import unmasked
-from etid.signals.transfer import frequency_variable
+from etid.signals.transfer import AnyArray, frequency_variable, widened
 
 _Same = TypeVar("_Same", bound="AbstractCircuit")
+
+STEP = 3e-6  # of ln element; differences of ln (τ^α / R) are then right to 1e-10
 
 
 def parameter(unit: str, *, typical: float) -> Any:
@@ -103,7 +105,7 @@ class AbstractCircuit(_Titled, Overviewed, Module):
     @classmethod
     def of_fit(cls: type[_Same], numbers: Iterable[Any]) -> _Same:
         """A circuit of the results of a fit, in the order of `names`: they may be 0 or negative."""
-        return jax.tree.unflatten(jax.tree.structure(cls()), list(numbers))
+        return jax.tree.unflatten(_structure(cls), list(numbers))
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -129,8 +131,9 @@ class AbstractCircuit(_Titled, Overviewed, Module):
         }
         return jnp.array([powers[unit] for unit in cls.units().values()]).T
 
-    @in_numpy
-    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
+    @in_float64
+    @np.errstate(all="ignore")  # elements of a fit that failed may be 0
+    def response(self, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """Impedance Z(j 2π f).
 
         Args:
@@ -139,12 +142,15 @@ class AbstractCircuit(_Titled, Overviewed, Module):
         Returns:
             Impedance [Ω] at each frequency, an array of NumPy outside of transformations of JAX.
         """
-        return self.impedance()(frequency_variable(jnp.asarray(frequency, float)))
+        circuit = self.of_fit(_plain(getattr(self, name)) for name in self.names())
+        z = circuit.impedance()(frequency_variable(_plain(frequency, float)))
+        return _plain(z)
 
-    @in_numpy
-    def values(self) -> Float[Array, "*lane parameter"]:
+    @in_float64
+    def values(self) -> Float[AnyArray, "*lane parameter"]:
         """Parameters in SI units, as an array of NumPy outside of transformations of JAX."""
-        return jnp.stack([getattr(self, name) for name in self.names()], axis=-1)
+        values = [_plain(getattr(self, name)) for name in self.names()]
+        return namespace(*values).stack(values, axis=-1)
 
     @program
     def log_values(self) -> Float[Array, "*lane parameter"]:
@@ -237,17 +243,118 @@ class AbstractCircuit(_Titled, Overviewed, Module):
 Circuit = TypeVar("Circuit", bound=AbstractCircuit)
 
 
+@np.errstate(all="ignore")  # a row whose fit fails may have any elements
+def impedance_at(
+    circuit: AbstractCircuit,
+    logs: Float[AnyArray, "*row element"],
+    frequency: Float[AnyArray, "*#row band"],
+) -> Complex[AnyArray, "*row band"]:
+    """Z [Ω] of a circuit whose elements have these logarithms, in the namespace of the arrays."""
+    xp = namespace(logs, frequency)
+    tree = _tree(type(circuit), _by_element(xp.exp(logs)))
+    shape = (*logs.shape[:-1], frequency.shape[-1])
+    return _as_rows(xp, tree(frequency_variable(widened(frequency, len(shape)))), shape)
+
+
+@np.errstate(all="ignore")
 def with_slopes(
-    circuit: AbstractCircuit, logs: Float[Array, " element"], frequency: Float[Array, " band"]
-) -> tuple[Complex[Array, " band"], Complex[Array, "element band"]]:
-    """Z [Ω] of a circuit whose elements have these logarithms, and its derivatives by them."""
-    s = frequency_variable(frequency)
+    circuit: AbstractCircuit,
+    logs: Float[AnyArray, "*row element"],
+    frequency: Float[AnyArray, "*#row band"],
+) -> tuple[Complex[AnyArray, "*row band"], Complex[AnyArray, "*row element band"]]:
+    """Z [Ω] of a circuit whose elements have these logarithms, and its derivatives by them.
 
-    def z(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
-        return circuit.with_log_values(logs).impedance()(s)
+    JAX differentiates what is in arrays of JAX. In NumPy the tree hands up exact slopes by the
+    fields of its elements, and central differences only tell how fields follow from the elements of
+    the circuit, as in Q = τ^α / R. They have no frequency, so that they cost little.
+    """
+    if namespace(logs, frequency) is jnp:
 
-    along = jax.vmap(lambda way: jax.jvp(z, (logs,), (way,)), out_axes=(None, 0))
-    return along(np.eye(logs.size))
+        def z(logs: Float[Array, "*row element"]) -> Complex[Array, "*row band"]:
+            return impedance_at(circuit, logs, frequency)
+
+        def along(way: Float[AnyArray, " element"]) -> Any:
+            return jax.jvp(z, (logs,), (jnp.broadcast_to(way, logs.shape),))
+
+        return jax.vmap(along, out_axes=(None, -2))(np.eye(logs.shape[-1]))
+
+    tree, parts = _tree_and_parts(type(circuit), logs)
+    value, by_field = tree.slopes(frequency_variable(widened(frequency, logs.ndim)))
+    rows, band = logs.shape[:-1], frequency.shape[-1]
+    sums: list[Any] = [None] * logs.shape[-1]
+    for field, place, part in parts:
+        slope = by_field[field] if part is None else by_field[field] * part
+        sums[place] = slope if sums[place] is None else sums[place] + slope
+    by_element = np.empty((*rows, logs.shape[-1], band), complex)
+    for place, slope in enumerate(sums):
+        by_element[..., place, :] = 0.0 if slope is None else slope
+    return _as_rows(np, value, (*rows, band)), by_element
+
+
+def _tree(kind: type[AbstractCircuit], values: Sequence[AnyArray]) -> AbstractImpedance:
+    """The tree of elements of a circuit."""
+    structure, places = _fields(kind)
+    if places is None:
+        return kind.impedance(kind.of_fit(values))
+    return jax.tree.unflatten(structure, [values[place] for place in places])
+
+
+def _tree_and_parts(
+    kind: type[AbstractCircuit], logs: Float[np.ndarray, "*row element"]
+) -> tuple[AbstractImpedance, list[tuple[int, int, Float[np.ndarray, "*row 1"] | None]]]:
+    """The tree, and ∂ ln field / ∂ ln element by their places, without zeros; None stands for 1."""
+    values, count = np.exp(logs), logs.shape[-1]
+    _, places = _fields(kind)
+    if places is not None:
+        return _tree(kind, _by_element(values)), [(f, e, None) for f, e in enumerate(places)]
+    ways = np.exp(STEP * np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)]))
+    moved = values * ways.reshape(-1, *[1] * (logs.ndim - 1), count)
+    fields, structure = jax.tree.flatten(_tree(kind, _by_element(moved)))
+    parts, fields = [], [np.asarray(of) for of in fields]
+    for place, of in enumerate(fields):
+        if of.ndim == moved.ndim:  # else it is a constant
+            fields[place] = of[0]
+            by_element = np.log(of[1 : count + 1] / of[count + 1 :]) / (2 * STEP)
+            parts += [(place, element, by_element[element]) for element in range(count)
+                      if by_element[element].any()]  # fmt: skip
+    return jax.tree.unflatten(structure, fields), parts
+
+
+@functools.cache
+def _fields(kind: type[AbstractCircuit]) -> tuple[Any, tuple[int, ...] | None]:
+    """Structure of the tree of a class, and which of its elements each field is.
+
+    The places are None if a field is computed from the elements, or is a constant.
+    """
+    circuit = kind()
+    fields, structure = jax.tree.flatten(circuit.impedance())
+    known = {id(getattr(circuit, name)): place for place, name in enumerate(kind.names())}
+    places = tuple(known.get(id(of), -1) for of in fields)
+    return structure, None if -1 in places else places
+
+
+def _by_element(values: Float[AnyArray, "*row element"]) -> list[AnyArray]:
+    """The values of each element, which broadcast with a band."""
+    if values.ndim == 1 and namespace(values) is jnp:  # traced sooner than with an axis of one
+        return [values[place] for place in range(values.shape[-1])]
+    return [values[..., place : place + 1] for place in range(values.shape[-1])]
+
+
+def _as_rows(xp: ModuleType, z: AnyArray, shape: tuple[int, ...]) -> AnyArray:
+    """Z at every frequency of every row, in this namespace."""
+    return xp.asarray(z) if z.shape == shape else xp.broadcast_to(z, shape)
+
+
+def _plain(of: Any, kind: Any = None) -> Any:
+    """An array of NumPy, unless JAX traces it."""
+    xp = jnp if isinstance(of, jax.core.Tracer) else np
+    return xp.asarray(of, kind)
+
+
+@functools.cache
+def _structure(kind: type[AbstractCircuit]) -> Any:
+    """Structure of a circuit, to which numbers are given without a check."""
+    return jax.tree.structure(kind())
 
 
 @functools.cache
@@ -274,10 +381,10 @@ class SkinRC(AbstractCircuit):
         return series(resistor(self.r_s), parallel(resistor(self.r_p), capacitor(self.c_p)))
 
     @property
-    @in_numpy
-    def f_c(self) -> Float[Array, "..."]:
+    @in_float64
+    def f_c(self) -> Float[AnyArray, "..."]:
         """Corner frequency 1 / (2π R_p C_p) [Hz]."""
-        return 1 / (2 * jnp.pi * jnp.asarray(self.r_p * self.c_p))
+        return 1 / (2 * np.pi * _plain(self.r_p) * _plain(self.c_p))
 
 
 class SkinCole(AbstractCircuit):

@@ -7,12 +7,13 @@ fall of the resistance to a thirtieth up to 25 mA:
     R(i) = 895 Ω + 60.1 kΩ ‖ (60.1 kΩ · 0.585 mA / |i|) = R_s + R_p / (1 + |i| / I_0).
 """
 
+import operator
 from collections.abc import Callable
 from functools import reduce
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Inexact
 
 from etid.circuits.circuit import AbstractCircuit, parameter
 from etid.circuits.elements import Farad, Ohm, Resistance, capacitor, resistor
@@ -22,10 +23,12 @@ from etid.circuits.impedance import (
     Parallel,
     Quantity,
     Series,
+    Slopes,
     parallel,
     series,
 )
-from etid.signals.transfer import reciprocal
+from etid.precision import namespace
+from etid.signals.transfer import AnyArray, reciprocal
 
 Ampere = Quantity
 
@@ -51,11 +54,25 @@ class CurrentDependentResistance(Resistance):
         """Geometric mean of the smallest and the largest slope u′ [Ω] for currents up to `size`."""
         return jnp.asarray(self.r) / (1 + size / jnp.asarray(self.i_0))
 
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Those at small currents, where I_0 has no effect."""
+        return _without_effect(*super().slopes(s))
+
+    def admittance_slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Those at small currents, where I_0 has no effect."""
+        return _without_effect(*super().admittance_slopes(s))
+
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Raise ValueError: a netlist of resistors and capacitors has no such part."""
         raise ValueError(
             "a resistor that depends on its current cannot be written as resistors and capacitors"
         )
+
+
+def _without_effect(
+    value: Complex[AnyArray, "..."], slopes: list[Inexact[AnyArray, "..."]]
+) -> Slopes:
+    return value, [*slopes, 0 * value]
 
 
 def current_dependent_resistor(r: Ohm, i_0: Ampere) -> CurrentDependentResistance:
@@ -151,7 +168,7 @@ def port(impedance: AbstractImpedance, source: Norton, s: Complex[Array, " frequ
     inner = [part for part in impedance.parts if current_dependent(part) is not None]
     others = [part for part in impedance.parts if part is not inner[0]]
     if isinstance(impedance, Series):
-        z = reduce(jnp.add, [part(s) for part in others], jnp.zeros_like(s))
+        z = reduce(operator.add, [part(s) for part in others], namespace(s).zeros_like(s))
         loss = reciprocal(1 + source.admittance * z)
         found = port(inner[0], Norton(source.current * loss, source.admittance * loss), s)
 
@@ -159,7 +176,9 @@ def port(impedance: AbstractImpedance, source: Norton, s: Complex[Array, " frequ
             voltage, current = found.outwards(signals)
             return Signals(voltage + z * current, current)
     else:
-        y = reduce(jnp.add, [part.admittance(s) for part in others], jnp.zeros_like(s))
+        y = reduce(
+            operator.add, [part.admittance(s) for part in others], namespace(s).zeros_like(s)
+        )
         found = port(inner[0], Norton(source.current, source.admittance + y), s)
 
         def outwards(signals: Signals) -> Signals:

@@ -19,7 +19,6 @@ replaces all faster relaxations. Both values are sums of geometric series.
 
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -31,11 +30,20 @@ from etid.circuits.impedance import (
     Netlist,
     Parallel,
     Quantity,
+    Slopes,
+    inverted,
     parallel,
     series,
 )
+from etid.precision import namespace
 from etid.signals.filtering import StateSpace
-from etid.signals.transfer import Rational, as_complex, reciprocal
+from etid.signals.transfer import (
+    AnyArray,
+    Rational,
+    as_complex,
+    from_parts,
+    reciprocal,
+)
 
 Ohm = Quantity
 Farad = Quantity
@@ -54,19 +62,34 @@ EXACT, GROUP = 12, 0.7  # slow relaxations of a diffusion that are exact; of ln 
 BEYOND = np.log(600.0)  # margin of ln x beyond the band: the ends are exact to first order only
 
 
+def _beside(s: Complex[AnyArray, "..."], value: Quantity) -> Complex[AnyArray, "..."]:
+    """A field of an element as complex numbers, in the namespace of both."""
+    return as_complex(namespace(s, value).asarray(value))
+
+
 class Resistance(AbstractRational):
     """A resistor, Z = R."""
 
     symbol: ClassVar[str] = "R"
     r: Ohm
 
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
-        return jnp.broadcast_to(as_complex(jnp.asarray(self.r)), s.shape)
+        return _wide(_beside(s, self.r), s)
 
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def admittance(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Admittance 1/Z [S]."""
-        return jnp.broadcast_to(as_complex(1 / jnp.asarray(self.r)), s.shape)
+        return _wide(self.admittance_slopes(s)[0], s)
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance and its slope, as numbers that broadcast with s."""
+        r = _beside(s, self.r)
+        return r, [r]
+
+    def admittance_slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Admittance and its slope, as numbers that broadcast with s."""
+        y = _beside(s, 1 / namespace(s, self.r).asarray(self.r))
+        return y, [-y]
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
@@ -83,13 +106,23 @@ class Capacitance(AbstractRational):
     symbol: ClassVar[str] = "C"
     c: Farad
 
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
         return reciprocal(self.admittance(s))
 
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def admittance(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Admittance 1/Z [S]."""
-        return s * as_complex(jnp.asarray(self.c))
+        return s * _beside(s, self.c)
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance and its slope."""
+        z = self(s)
+        return z, [-z]
+
+    def admittance_slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Admittance and its slope."""
+        y = self.admittance(s)
+        return y, [y]
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
@@ -107,9 +140,14 @@ class Inductance(AbstractRational):
     symbol: ClassVar[str] = "L"
     inductance: Henry
 
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
-        return s * as_complex(jnp.asarray(self.inductance))
+        return s * _beside(s, self.inductance)
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance and its slope."""
+        z = self(s)
+        return z, [z]
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
@@ -128,15 +166,29 @@ class ConstantPhase(AbstractIrrational):
     q: PseudoCapacitance
     alpha: Exponent
 
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
         return reciprocal(self.admittance(s))
 
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def admittance(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Admittance 1/Z [S], with the branch of s^α that is real for s > 0."""
-        log, alpha = jnp.log(s), jnp.asarray(self.alpha)
-        power = jnp.exp(jax.lax.complex(alpha * log.real, alpha * log.imag))
-        return as_complex(jnp.asarray(self.q)) * power
+        return _beside(s, self.q) * namespace(s, self.alpha).exp(self._log_power(s))
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance and its slopes."""
+        return inverted(*self.admittance_slopes(s))
+
+    def admittance_slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Admittance and its slopes."""
+        log_power = self._log_power(s)
+        y = _beside(s, self.q) * namespace(s, self.alpha).exp(log_power)
+        return y, [y, y * log_power]
+
+    def _log_power(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
+        """α ln s."""
+        xp = namespace(s, self.alpha)
+        log, alpha = xp.log(s), xp.asarray(self.alpha)
+        return from_parts(alpha * log.real, alpha * log.imag)
 
     def exponents(self) -> tuple[Exponent, ...]:
         """Exponent α."""
@@ -182,15 +234,29 @@ class Diffusion(AbstractIrrational):
     r: Ohm
     tau: Second
 
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
-        r, tau = jnp.asarray(self.r), jnp.asarray(self.tau)
-        x = s * as_complex(tau)
-        x = jnp.where(x == 0, as_complex(jnp.full_like(tau, LEAST)), x)
-        root = jnp.exp(as_complex(jnp.asarray(0.5)) * jnp.log(x))  # its real part is positive
-        gone = jnp.exp(as_complex(jnp.asarray(-2.0)) * root)
-        one = as_complex(jnp.ones(()))
-        return as_complex(r) * (one - gone) * reciprocal(root * (one + gone))
+        root, gone = self._root(s)
+        one = _beside(s, 1.0)
+        return _beside(s, self.r) * (one - gone) * reciprocal(root * (one + gone))
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance, and its slopes Z and (R / cosh² √(sτ) − Z) / 2."""
+        root, gone = self._root(s)
+        one, r = _beside(s, 1.0), _beside(s, self.r)
+        near = reciprocal(one + gone)
+        z = r * (one - gone) * near * reciprocal(root)
+        return z, [z, _beside(s, 2.0) * r * gone * near * near - _beside(s, 0.5) * z]
+
+    def _root(
+        self, s: Complex[AnyArray, "..."]
+    ) -> tuple[Complex[AnyArray, "..."], Complex[AnyArray, "..."]]:
+        """√(sτ) and e^(−2 √(sτ)); the real part of the root is positive."""
+        xp, tau = namespace(s, self.tau), _beside(s, self.tau)
+        x = s * tau
+        x = xp.where(x == 0, xp.full_like(tau, LEAST), x)
+        root = xp.exp(_beside(s, 0.5) * xp.log(x)) if xp is jnp else xp.sqrt(x)
+        return root, xp.exp(_beside(s, -2.0) * root)
 
     def exponents(self) -> tuple[Exponent, ...]:
         """Empty: no exponent of it can exceed that of a passive element."""
@@ -222,6 +288,11 @@ class Diffusion(AbstractIrrational):
         x = _poles(high * tau)
         pairs = [parallel(resistor(2 * r / one), capacitor(tau / (2 * r))) for one in x]
         series(resistor(r - float(np.sum(2 * r / x))), *pairs).connect(netlist, plus, minus)
+
+
+def _wide(z: Complex[AnyArray, "..."], s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
+    """Numbers that do not depend on s, for every s."""
+    return namespace(s, z).broadcast_to(z, np.broadcast_shapes(z.shape, s.shape))
 
 
 def _poles(highest: float) -> Float[np.ndarray, " n"]:
@@ -345,5 +416,5 @@ def cole(r: Ohm, tau: Second, alpha: Exponent) -> Parallel:
         tau: τ [s].
         alpha: α, above 0 and at most 1. With α = 1 it is a resistor parallel to a capacitor.
     """
-    r, tau, alpha = map(jnp.asarray, (r, tau, alpha))
+    r, tau, alpha = map(namespace(r, tau, alpha).asarray, (r, tau, alpha))
     return parallel(resistor(r), constant_phase(tau**alpha / r, alpha))

@@ -5,10 +5,19 @@ exactly at any s, even if it is not a ratio of polynomials. It can also be writt
 Everything that depends on the kind of an element is a method of its class. A new kind of element
 is one subclass of `AbstractRational`, or of `AbstractIrrational` if its impedance is not a ratio of
 polynomials.
+
+**Rows.** The elements have any leading axes that broadcast with s. A tree computes in NumPy if s
+and its elements are arrays of NumPy, else in JAX.
+
+**Slopes.** `slopes` gives ∂Z/∂ln e for each field e of each element. A connection hands them up:
+
+    in series dZ = Σ dZ_i,      in parallel dZ = −Z² Σ dY_i.
 """
 
 import abc
 import dataclasses
+import itertools
+import operator
 from functools import reduce
 from typing import ClassVar
 
@@ -16,14 +25,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Inexact
 
 from etid.precision import Module
 from etid.signals.filtering import StateSpace
-from etid.signals.transfer import Rational, reciprocal
+from etid.signals.transfer import AnyArray, Rational, reciprocal
 
 # Type of a parameter: one value, or a batch of values.
 Quantity = Float[Array, "..."] | Float[np.ndarray, "..."] | float
+# Z or Y, and its slopes by the logarithms of all fields, each of which broadcasts with it.
+Slopes = tuple[Complex[AnyArray, "..."], list[Inexact[AnyArray, "..."]]]
+STEP_OF_FIELD = 1e-5  # relative; slopes by differences are then right to 1e-10 of Z
 
 
 class Names:
@@ -76,13 +88,24 @@ class Notation(Names):
 class AbstractImpedance(Module):
     """A network between two terminals, as a function of s [rad/s]."""
 
+    # Of each method that is looked up, equinox makes a module. That takes longer than a formula.
+    __getattribute__ = object.__getattribute__
+
     @abc.abstractmethod
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
 
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def admittance(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Admittance 1/Z [S]."""
         return reciprocal(self(s))
+
+    @abc.abstractmethod
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance and its slopes by the fields of all elements, in their order."""
+
+    def admittance_slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Admittance and its slopes by the fields of all elements, in their order."""
+        return inverted(*self.slopes(s))
 
     @abc.abstractmethod
     def elements(self) -> "tuple[AbstractElement, ...]":
@@ -145,6 +168,21 @@ class AbstractElement(AbstractImpedance):
     def elements(self) -> "tuple[AbstractElement, ...]":
         """The element itself."""
         return (self,)
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Central differences; an element of etid replaces them by exact slopes."""
+        fields, structure = jax.tree.flatten(self)
+
+        def moved(place: int, factor: float) -> Complex[AnyArray, "..."]:
+            of = fields[place] * factor
+            return jax.tree.unflatten(structure, [*fields[:place], of, *fields[place + 1 :]])(s)
+
+        up, down = 1 + STEP_OF_FIELD, 1 - STEP_OF_FIELD
+        rows = [
+            (moved(place, up) - moved(place, down)) / (2 * STEP_OF_FIELD)
+            for place in range(len(fields))
+        ]
+        return self(s), rows
 
     @abc.abstractmethod
     def exponents(self) -> tuple[Quantity, ...]:
@@ -212,9 +250,13 @@ class Series(AbstractConnection):
 
     parts: tuple[AbstractImpedance, ...]
 
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
-        return reduce(jnp.add, [part(s) for part in self.parts])
+        return reduce(operator.add, [part(s) for part in self.parts])
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance and its slopes."""
+        return _added([part.slopes(s) for part in self.parts])
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
@@ -242,13 +284,21 @@ class Parallel(AbstractConnection):
 
     parts: tuple[AbstractImpedance, ...]
 
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
         return reciprocal(self.admittance(s))
 
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+    def admittance(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Admittance 1/Z [S]."""
-        return reduce(jnp.add, [part.admittance(s) for part in self.parts])
+        return reduce(operator.add, [part.admittance(s) for part in self.parts])
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance and its slopes."""
+        return inverted(*self.admittance_slopes(s))
+
+    def admittance_slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Admittance and its slopes."""
+        return _added([part.admittance_slopes(s) for part in self.parts])
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
@@ -267,6 +317,19 @@ class Parallel(AbstractConnection):
     def text(self, notation: Notation) -> str:
         """The parts, separated by commas, in p()."""
         return f"p({','.join(part.text(notation) for part in self.parts)})"
+
+
+def inverted(value: Complex[AnyArray, "..."], slopes: list[Inexact[AnyArray, "..."]]) -> Slopes:
+    """Admittance and its slopes from those of an impedance, or the other way."""
+    inverse = reciprocal(value)
+    square = -(inverse * inverse)
+    return inverse, [square * of for of in slopes]
+
+
+def _added(parts: list[Slopes]) -> Slopes:
+    """The sum of the values, and the slopes of all of them."""
+    values, slopes = zip(*parts, strict=True)
+    return reduce(operator.add, values), list(itertools.chain(*slopes))
 
 
 def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
