@@ -79,7 +79,7 @@ class Resistance(AbstractRational):
 
     def admittance(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Admittance 1/Z [S]."""
-        return _wide(self.admittance_slopes(s)[0], s)
+        return _wide(self._inverse(s), s)
 
     def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
         """Impedance and its slope, as numbers that broadcast with s."""
@@ -88,8 +88,11 @@ class Resistance(AbstractRational):
 
     def admittance_slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
         """Admittance and its slope, as numbers that broadcast with s."""
-        y = _beside(s, 1 / namespace(s, self.r).asarray(self.r))
+        y = self._inverse(s)
         return y, [-y]
+
+    def _inverse(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
+        return _beside(s, 1 / namespace(s, self.r).asarray(self.r))
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
