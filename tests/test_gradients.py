@@ -12,9 +12,11 @@ import pytest
 import etid
 from benchmarks.perturbed_study import drawn_driver
 from etid.estimators import lanes
+from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import search
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.identify import samples
+from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, HarmonicDriver
 from etid.signals.noise import noise, noise_of
 from etid.simulation.scenes import Scene, Trial
@@ -80,7 +82,7 @@ def test_derivatives_by_both_records_are_differences_of_fits(monkeypatch):
         found = noise(v, step)
         return found + jax.lax.stop_gradient(held.pop(0) - found)
 
-    monkeypatch.setattr(samples, "noise", known)
+    monkeypatch.setattr(samples, "floor", known)
     # Then the noise at each harmonic is that of white noise of this size, held too.
     monkeypatch.setattr(lanes, "noise_of", lambda v, *of: noise_of(0 * v, *of))
 
@@ -120,11 +122,15 @@ def test_derivatives_by_both_records_are_differences_of_fits(monkeypatch):
             np.testing.assert_allclose(found, difference, rtol=0.0, atol=0.01)
 
 
-def test_what_is_estimated_before_a_fit_is_held(monkeypatch):
-    """Noise, and what aliases add to it; three periods of 334 samples join aliases and harmonics.
+def three_periods():
+    """Of 334 samples: aliases fall on the harmonics."""
+    pulses = 100.0 * (np.arange(1002) % 334 < 14)
+    return pulses + np.random.default_rng(0).standard_normal((2, 1002))
 
-    The records themselves are not held.
-    """
+
+@pytest.fixture
+def unfitted(monkeypatch):
+    """The lane that would be fitted to the arrays of a recording."""
     lanes = []
 
     def seen(lane, *_):
@@ -132,20 +138,36 @@ def test_what_is_estimated_before_a_fit_is_held(monkeypatch):
         raise InterruptedError  # its fit is not needed
 
     monkeypatch.setattr(samples, "skin_lane", seen)
-    pulses = 100.0 * (np.arange(1002) % 334 < 14)
-    records = jnp.asarray(pulses + np.random.default_rng(0).standard_normal((2, 1002)))
     driver = object.__new__(HarmonicDriver)  # whose numbers nobody reads
-
     for name in ("known", "check_driver"):
         monkeypatch.setattr(MaximumLikelihood, name, lambda *_: None)
 
-    def arrays(v_th, v_out):
+    def lane(v_th, v_out):
         with contextlib.suppress(InterruptedError):
             etid.identify_samples(v_th, v_out, driver, sample_rate=334.0, pulse_rate=1.0)
-        one = lanes.pop()
+        return lanes.pop()
+
+    return lane
+
+
+def test_arrays_have_the_weights_of_a_recording(unfitted):
+    """White noise was a floor besides: where the noise scatters above it, it was kept."""
+    records = three_periods()
+    one = etid.Recording(*records, sample_rate=334.0, pulse_rate=1.0)
+    found, of = unfitted(*records), Harmonics.of(Inspected(one))
+    for one, other in ((found.variance_x, of.variance_x), (found.variance_y, of.variance_y)):
+        np.testing.assert_allclose(one, other, rtol=1e-9)  # rounding, of 1 002 samples
+
+
+def test_what_is_estimated_before_a_fit_is_held(unfitted):
+    """Noise, and what aliases add to it; the records themselves are not held."""
+
+    def arrays(v_th, v_out):
+        one = unfitted(v_th, v_out)
         return one.variance_x, one.variance_y, one.x, one.y
 
-    _, slopes = jax.jvp(arrays, tuple(records), tuple(records))
+    records = tuple(jnp.asarray(three_periods()))
+    _, slopes = jax.jvp(arrays, records, records)
     of_x, of_y, x, y = slopes
     assert not np.any(of_x)
     assert not np.any(of_y)

@@ -4,9 +4,10 @@ import pytest
 import scipy.signal
 
 from etid.signals.harmonics import WINDOW
-from etid.signals.noise import noise_std
+from etid.signals.noise import noise
 from etid.signals.quick_looks import shows_few
 from etid.signals.rounding import _around
+from etid.signals.white_noise import noise_std
 
 
 def test_white_noise_on_a_pulse_is_unbiased():
@@ -34,7 +35,7 @@ def test_noise_has_the_unit_of_the_record(unit):
 
 
 def test_converter_steps_are_a_floor():
-    assert float(noise_std(np.zeros(100), 0.012)) == pytest.approx(0.012 / np.sqrt(12))
+    assert float(noise(np.zeros(100), np.asarray(0.012))) == pytest.approx(0.012 / np.sqrt(12))
 
 
 def test_infinite_samples_are_one_value_of_a_converter():

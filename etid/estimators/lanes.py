@@ -163,7 +163,7 @@ class Harmonics(AbstractLane):
         both = harmonics(jnp.stack([of[: periods[1]] for of in (m.v_th, m.v_out)]), *periods)
         records = jnp.stack([m.v_th, m.v_out])
         least = jnp.stack([m.sigma_th, m.sigma_out])[:, None] ** 2 / periods[1]
-        found = jax.vmap(lambda v: noise_of(v, *periods).power)(records)
+        found = jax.vmap(lambda v: noise_of(v, *periods).variance)(records)
         noise = jax.lax.stop_gradient(jnp.maximum(found, least))
         fields = map(jnp.asarray, filled(both, noise, m.sample_rate, *periods))
         frequency, x, y, of_x, of_y, selected = fields

@@ -20,7 +20,7 @@ from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
 from etid.signals.harmonics import whole_periods
 from etid.signals.missing import unmasked
-from etid.signals.noise import Measurement, noise
+from etid.signals.noise import Measurement, floor, noise
 
 
 @in_float64
@@ -72,8 +72,10 @@ def identify_samples(
     v_th, v_out, step, rate = (
         jnp.asarray(unmasked(value), float) for value in (v_th, v_out, resolution, sample_rate)
     )
-    # The noise is a median: by its derivative, few samples would have most of the weight.
-    of_th, of_out = (jax.lax.stop_gradient(jnp.asarray(noise(v, step))) for v in (v_th, v_out))
+    # At harmonics the noise is measured, and its floor is needed only. White noise is a median: by
+    # its derivative, few samples would have most of the weight.
+    of = floor if estimator.lane.periodic else noise
+    of_th, of_out = (jax.lax.stop_gradient(jnp.asarray(of(v, step))) for v in (v_th, v_out))
     lane = estimator.lane.of_samples(Measurement(v_th, v_out, of_th, of_out, rate), periods)
     known = (
         estimator.known(driver, jnp.asarray(lane.frequency), True)

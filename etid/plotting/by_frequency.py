@@ -114,7 +114,7 @@ def sample_std(seen: Inspected, feed: AbstractFeed, circuit: AbstractCircuit) ->
 
     over the harmonics, each of which stands for the P bins around it.
     """
-    of_th, of_out = seen.noise.of_each
+    of_th, of_out = seen.noise.power
     periods = max(seen.periods[0], 1)
     samples = seen.periods[1] if seen.periods[0] else seen.v_out.size
     harmonic = np.arange(1.0, of_out.size + 1)

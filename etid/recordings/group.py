@@ -21,7 +21,7 @@ from etid.signals.disturbances import (
 )
 from etid.signals.harmonics import filled, harmonics, separates_aliases, whole_periods
 from etid.signals.mains import Hum, separated
-from etid.signals.noise import RIPPLE, Noise, noise_of
+from etid.signals.noise import Noise, floor, noise_of
 from etid.signals.pulse_train import (
     PulseTrain,
     clocks_apart,
@@ -224,7 +224,7 @@ class Group:
     @functools.cached_property
     def trusted(self) -> Float[np.ndarray, "recording 2"]:
         """`noise` as far as estimators trust it: not below the error of the interpolation."""
-        return np.maximum(self.noise, RIPPLE * np.ptp(self.limits, axis=-1))
+        return np.maximum(self.noise, floor(self.limits, self.step))
 
     @functools.cached_property
     @quietly()
@@ -256,9 +256,9 @@ class Group:
     @quietly()
     def noise_of_quiet(self, periods: int, samples: int) -> Noise:
         """The noise of `quiet`: at least the rounding and the error of the interpolation."""
-        least = np.maximum(RIPPLE * np.ptp(self.limits, axis=-1), self.step / math.sqrt(12.0))
         noise = self._noise(self.quiet, periods, samples)
-        return noise._replace(power=np.maximum(noise.power, least[..., None] ** 2 / samples))
+        least = floor(self.limits, self.step)[..., None] ** 2 / samples
+        return noise._replace(power=np.maximum(noise.power, least))
 
     @quietly()
     def spectra(self, periods: int, samples: int) -> tuple[np.ndarray, ...]:
@@ -266,7 +266,7 @@ class Group:
         if (periods, samples) not in self._spectra:
             found = np.asarray(harmonics(self.quiet, periods, samples))
             noise = self.noise_of_quiet(periods, samples)
-            power = np.array(noise.power)
+            power = np.array(noise.variance)
             for row in self._aliased(found, power, periods, samples):
                 spacing = self.spacing(row)
                 of = weights(spacing % 1, periods)

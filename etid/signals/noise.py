@@ -1,13 +1,12 @@
-"""The noise of a record, estimated from the record itself.
+"""The noise of a record by frequency, estimated from the record itself.
 
-**By frequency.** Noise is measured where it acts: at each harmonic of the pulse rate. Pulses repeat
-and noise does not, so the bins of the transform between the harmonics hold noise alone (Pintelon
-and Schoukens, *System Identification*, 2012, chapter 2): white, 1/f, that of an amplifier before an
-anti-alias filter, of a converter, and hum. Where the pulse rate is not exactly that of the
-transform, pulses leak into these bins, and aliases of their edges fall there. So the record is
-first multiplied by a window that repeats in each period and is 0 at the edges. The window is smooth
-and leaves the quiet parts as they are. For a periodic signal it changes nothing between the
-harmonics. A signal without quiet parts, such as a multisine, is left as it is.
+Noise is measured where it acts: at each harmonic of the pulse rate. Pulses repeat and noise does
+not, so the bins of the transform between the harmonics hold noise alone (Pintelon and Schoukens,
+*System Identification*, 2012, chapter 2): white, 1/f, that of an amplifier before an anti-alias
+filter, of a converter, and hum. Where the pulse rate is not exactly that of the transform, pulses
+leak into these bins, and aliases of their edges fall there. So the record is first multiplied by a
+window that leaves its quiet parts only (`etid.signals.quiet_parts`). A signal without quiet parts,
+such as a multisine, is left as it is.
 
 A single period has no bins between harmonics. There the quiet part shows the noise, except at the
 lowest frequencies, where the tail of the pulse is larger.
@@ -15,16 +14,6 @@ lowest frequencies, where the tail of the pulse is larger.
 The power is averaged over bands of neighbouring bins. The mean of n powers m has the gamma
 distribution, so E[1/m] = n/(n − 1)/σ²; it is enlarged by this factor, so that weights are right in
 the mean.
-
-**White noise.** High-order differences remove the smooth part of a pulse response and keep the
-white noise. The median of their magnitude gives its standard deviation (Donoho & Johnstone 1994 use
-the finest wavelet coefficients in the same way). The median ignores the few per cent of samples at
-the edges. This serves a single period without a quiet part. A tone at 0.18 of the sample rate
-passes these differences with a twentieth of its size. In a record whose differences do not change
-their sign as often as those of white noise, the top of the band shows the noise too. The smaller
-noise is taken (`_quietest`).
-
-The noise of a converter is at least resolution/√12.
 """
 
 import functools
@@ -38,38 +27,21 @@ from jaxtyping import Array, Bool, Float, Int
 
 from etid.precision import Module
 from etid.signals.harmonics import namespace
+from etid.signals.quiet_parts import are_loud, changes, window_of
+from etid.signals.white_noise import noise_std, quietest
 
-# Order of the differences; the ringing after the edges, at a quarter of the rate, is still smooth
-# to them.
-ORDER = 6
-DIFFERENCE = np.array([(-1.0) ** k * math.comb(ORDER, k) for k in range(ORDER + 1)])
-# Noise of a sample over the median size of a difference; a normal x has σ = 1.4826 · median |x|.
-PER_MEDIAN = 1.482602218505602 / math.sqrt(np.sum(DIFFERENCE**2))
-# Shares of sixth differences of white noise that have another sign than the first and the second
-# one after them: arccos(ρ)/π, with the correlations ρ of −6/7 and 15/28.
-CHANGES = np.arccos([-6 / 7, 15 / 28]) / np.pi
 RIPPLE = 1e-5  # error of the interpolation relative to the signal: a lower limit of the noise
 
-
-# --- By frequency --------------------------------------------------------------------------------
-
-BLOCKS = 128  # parts of a period that are quiet or not
-LOUD = 4.0  # power of the differences of a part that is not quiet, relative to that of quiet parts
-PULSED = 30.0  # the same of the edges of a pulse; the crests of a multisine stay below
-EDGE = 8  # parts over which the window rises
 FEWEST = 12  # powers that are averaged at least: a band is known to 30 %
 UNSEEN = 48  # bins of a single period that its own tail fills
 EXACT = 0.01  # [samples] the leakage of a multisine to 6 kHz at 60 dB stays below its noise
-QUIET = 0.1  # mean of a window that leaves enough of a record
+TOGETHER = 100_000  # samples of records that are transformed together; more leave the cache
 
 
 class _Layout(NamedTuple):
     """How records of one length are divided.
 
     Attributes:
-        at: First sample of each part of each period.
-        part: Part of whose centre each sample is the next one.
-        beyond: Place of each sample between the centres of this part and the next one, 0 to 1.
         used: 1 for each bin below half the sample rate that is used, 0 for harmonics.
         edges: First bin of each band.
         number: Number of bins in each band.
@@ -81,9 +53,6 @@ class _Layout(NamedTuple):
             the means of the periods, because the pulses of a period are no drift.
     """
 
-    at: Int[np.ndarray, " part"]
-    part: Int[np.ndarray, " time"]
-    beyond: Float[np.ndarray, " time"]
     used: Float[np.ndarray, " bin"]
     edges: Int[np.ndarray, " band"]
     number: Float[np.ndarray, " band"]
@@ -100,10 +69,6 @@ def _layout(periods: int, samples: int) -> _Layout:
 
     The width of a band is a fifth of its frequency, at most 1/64 of all.
     """
-    length = samples / (periods * BLOCKS)
-    place = np.arange(samples) / length - 0.5
-    part = np.floor(place).astype(int)
-    at = np.minimum(np.rint(np.arange(periods * BLOCKS) * length), samples - 2).astype(int)
     bins = np.arange(periods, (samples + 1) // 2, periods)
     of_harmonic = max(periods - 1, 1)
     least = math.ceil(FEWEST / of_harmonic)
@@ -128,10 +93,7 @@ def _layout(periods: int, samples: int) -> _Layout:
     before = np.floor(turn)
     stairs = np.diff(before * (turn - (before + 1) / 2)) - (periods - 1) / 2 * periods / samples
     return _Layout(
-        at=at,
-        part=part % BLOCKS,
-        beyond=place - part,
-        used=used.astype(np.float32),
+        used=1.0 * used,
         edges=edges * periods + (periods == 1),
         number=1.0 * width * of_harmonic,
         below=below,
@@ -159,11 +121,13 @@ class Noise(NamedTuple):
     bins: Float[Array | np.ndarray, "*record"]
 
     @property
-    def of_each(self) -> Float[Array | np.ndarray, "*record harmonic"]:
-        """`power`, but harmonics of the ends are not enlarged to be together as good as one."""
-        return namespace(self.power).where(
-            self.of_ends, self.power / self.power.shape[-1], self.power
-        )
+    def variance(self) -> Float[Array | np.ndarray, "*record harmonic"]:
+        """Variance of independent errors that stand for this noise.
+
+        What the ends bring is one number: all harmonics of the ends together are as good as one.
+        """
+        enlarged = self.power * self.power.shape[-1]
+        return namespace(self.power).where(self.of_ends, enlarged, self.power)
 
     def std(self, samples: int) -> Float[Array | np.ndarray, "*record"]:
         """Standard deviation of a sample of white noise as strong as this noise is in the middle.
@@ -199,19 +163,20 @@ def noise_of(
         white = jnp.vectorize(noise_std, signature="(time)->()")(v) ** 2 / samples
         return found._replace(
             power=jnp.where(kept < 1, found.power, white[..., None]),
+            of_ends=found.of_ends & (kept < 1),
             bins=jnp.where(kept[..., 0] < 1, found.bins, 0.0),
         )
     rest = np.broadcast_to(rest, v.shape[:-1])
     for place in map(tuple, np.argwhere(kept[..., 0] == 1)):
         of = _of_loud(v[place], periods, float(rest[place]), found.power.shape[-1])
-        found.power[place], found.bins[place] = of
+        found.power[place], found.of_ends[place], found.bins[place] = of
     return found
 
 
 def _of_loud(
     v: Float[np.ndarray, " time"], periods: int, rest: float, count: int
-) -> tuple[Float[np.ndarray, " harmonic"], float]:
-    """Power and bins of the noise of a record whose signal is never quiet, such as a multisine.
+) -> tuple[Float[np.ndarray, " harmonic"], Bool[np.ndarray, " harmonic"], float]:
+    """`Noise.power`, `of_ends` and `bins` of a record that is never quiet, such as a multisine.
 
     It leaks between the harmonics unless the periods end at a sample. If two or more of them do,
     the noise is measured in these; if not, it is taken for white.
@@ -220,12 +185,13 @@ def _of_loud(
     ends = whole * ((v.size + rest) / periods)
     exact = np.flatnonzero(np.abs(ends - np.rint(ends)) < EXACT)
     if exact.size == 0:
-        return np.full(count, _quietest(v) ** 2 / v.size), 0.0
+        return np.full(count, quietest(v) ** 2 / v.size), np.zeros(count, bool), 0.0
     last = exact[-1]
     samples = round(float(ends[last]))
     of, _ = _measured(v[:samples], int(whole[last]))
-    power = np.asarray(of.power)[np.minimum(np.arange(count), of.power.size - 1)]
-    return power * (samples / v.size), float(of.bins)
+    at = np.minimum(np.arange(count), of.power.size - 1)
+    power, of_ends = np.asarray(of.power)[at], np.asarray(of.of_ends)[at]
+    return power * (samples / v.size), of_ends, float(of.bins)
 
 
 def _measured(
@@ -234,23 +200,23 @@ def _measured(
     """The noise at each harmonic, and the part of the record that the window has kept."""
     xp, samples = namespace(v), v.shape[-1]
     layout = _layout(periods, samples)
-    if xp is np:  # one record after the other, because each fits into the cache of a processor
-        each = zip(*(_between(of, periods) for of in v.reshape(-1, samples)), strict=True)
-        sums, kept, usual = (np.reshape(of, (*v.shape[:-1], -1)) for of in each)
+    if xp is np:
+        flat, some = v.reshape(-1, samples), max(TOGETHER // samples, 1)
+        parts = (_between(flat[i : i + some], periods) for i in range(0, len(flat), some))
+        each = map(np.concatenate, zip(*parts, strict=True))
+        sums, kept, usual = (of.reshape(*v.shape[:-1], -1) for of in each)
     else:
         sums, kept, usual = _between(v, periods)
     means = _smooth(sums / (samples**2 * kept), layout.number)
     rise = xp.concatenate([xp.diff(means, axis=-1), xp.zeros_like(kept)], axis=-1)
     power, rise = (xp.take(of, layout.below, axis=-1) for of in (means, rise))
     power = power + layout.above * rise
-    # What a filter has left of the noise may be less than what the ends of the record bring. That
-    # is one number, so that all these harmonics together are as good as one.
+    # What a filter has left of the noise may be less than what the ends of the record bring.
     # Drifts and hum below are treated elsewhere.
     leak = layout.leak * (2 * periods * power[..., power.shape[-1] // 64 :].sum(-1)[..., None])
     of_ends = leak * (10 * periods) > power
-    power = xp.where(of_ends, xp.maximum(power, leak) * leak.shape[-1], power)
     bins = xp.full(kept.shape[:-1], layout.number.sum())
-    return Noise(power, of_ends, usual[..., 0], bins), kept
+    return Noise(xp.maximum(power, leak), of_ends, usual[..., 0], bins), kept
 
 
 def _smooth(
@@ -279,161 +245,20 @@ def _between(
     """
     xp, samples = namespace(v), v.shape[-1]
     layout = _layout(periods, samples)
-    change = xp.diff(v)
-    change = xp.add.reduceat(change * change, layout.at, axis=-1)
-    change = change.reshape(*change.shape[:-1], periods, BLOCKS)
-    loud = _loud(xp.sort(change, axis=-2)[..., periods // 2, :])
+    change = changes(v, periods)
+    loud = are_loud(change)
     of_period = xp.where(loud[..., None, :], 0.0, change).sum(-1)
     middle = xp.sort(of_period, axis=-1)[..., [periods // 2]]
     mean = of_period.mean(-1)[..., None]
     usual = xp.where((mean > 0) & (periods > 2), middle / xp.where(mean > 0, mean, 1.0), 1.0)
-    if xp is np:
-        window = _known(loud.tobytes(), periods, samples)
-    else:
-        window = _risen(loud, periods, samples)
+    window = window_of(loud, periods, samples)
     slope = xp.vecdot(v, layout.stairs)[..., None]
     quiet = (v - xp.mean(v, axis=-1, keepdims=True) - slope * layout.line) * window
-    # In single precision it is faster, and exact to 1e-7 of the quiet parts.
-    transform = np.fft.rfft(quiet.astype(np.float32)) if xp is np else jnp.fft.rfft(quiet)
+    transform = xp.fft.rfft(quiet)
     squares = xp.real(transform) ** 2 + xp.imag(transform) ** 2
-    used = squares[..., : layout.used.size] * xp.asarray(layout.used, squares.dtype)
+    used = squares[..., : layout.used.size] * layout.used
     sums = xp.add.reduceat(used, layout.edges, axis=-1) / np.maximum(layout.number - 1, 1.0)
     return sums, xp.vecdot(window, window)[..., None] / samples, usual
-
-
-def _loud(
-    change: Float[Array | np.ndarray, "*record part"],
-) -> Bool[Array | np.ndarray, "*record part"]:
-    """Which parts of a period change by more than the noise."""
-    xp = namespace(change)
-    usual = xp.sort(change, axis=-1)[..., [BLOCKS // 4]]
-    # Without much louder parts nothing shows that the rest is quiet.
-    pulsed = xp.max(change, axis=-1, keepdims=True) > PULSED * usual
-    return (change > LOUD * usual) & pulsed
-
-
-@functools.lru_cache(maxsize=64)
-def _known(loud: bytes, periods: int, samples: int) -> Float[np.ndarray, " time"]:
-    return np.asarray(_risen(np.frombuffer(loud, bool), periods, samples))
-
-
-def _rise(place: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
-    """A raised cosine from 0 to 1, over 2 `EDGE` parts around 0."""
-    turn = np.clip(place / (2 * EDGE), -0.5, 0.5)
-    return turn + 0.5 + np.sin(2 * np.pi * turn) / (2 * np.pi)
-
-
-def _risen(
-    loud: Bool[Array | np.ndarray, "*record part"], periods: int, samples: int
-) -> Float[Array | np.ndarray, "*record time"]:
-    """The window of records with these loud parts: 0 there, 1 from 2 `EDGE` parts beside them."""
-    xp, layout = namespace(loud), _layout(periods, samples)
-    near = xp.zeros(loud.shape, bool)
-    for beside in range(-EDGE, EDGE + 1):
-        near = near | xp.roll(loud, beside, axis=-1)
-    far = xp.where(near, 0.0, 1.0)
-    window = 0.0
-    for part in range(-EDGE, EDGE + 2):  # smooth at every sample: kinks would be lines of the tail
-        place = layout.beyond - part
-        share = _rise(place + 0.5) - _rise(place - 0.5)
-        window = window + far[..., (layout.part + part) % BLOCKS] * share
-    return xp.where(xp.mean(window, axis=-1)[..., None] > QUIET, window, 1.0)
-
-
-# --- White noise ---------------------------------------------------------------------------------
-
-
-def _median(x: Float[Array, " sample"]) -> Float[Array, ""]:
-    """Median of numbers that are not negative, by bisection.
-
-    For an even count the result is one of the two middle numbers. `jnp.median` sorts, which costs
-    ten times as much.
-    """
-    half, fixed = x.shape[0] / 2, jax.lax.stop_gradient(x)
-
-    def halve(
-        _: int | Int[Array, ""], bounds: tuple[Float[Array, ""], Float[Array, ""]]
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        low, high = bounds
-        middle = (low + high) / 2
-        below = jnp.sum(fixed <= middle, dtype=x.dtype) < half
-        return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
-    # To 1e-12 of the largest difference, which is at most 1e5 times the noise (at an edge).
-    bounds = jnp.zeros((), x.dtype), jnp.max(fixed)
-    low, high = jax.lax.fori_loop(0, 40, halve, bounds)
-    return x[jnp.argmin(jnp.abs(fixed - (low + high) / 2))]
-
-
-def noise_std(
-    v: Float[Array | np.ndarray, "*record time"],
-    resolution: Float[Array | np.ndarray, "*record"] | float = 0.0,
-) -> Float[Array | np.ndarray, "*record"]:
-    """Standard deviation of the white noise in `v`, in the unit of `v`.
-
-    In records of more than 30 000 samples it comes from every second difference, in half of the
-    time. Neighbouring differences share most of their samples, so the standard error grows from
-    0.94 to 1.02 % only (33 330 samples). It is a weight, and enters standard errors and limits of
-    tests in proportion.
-
-    Args:
-        v: Samples of the record, or of several records as an array of NumPy.
-        resolution: Step of the converter, in the unit of `v`; 0 if it is not known.
-    """
-    floor = resolution / math.sqrt(12.0)
-    if isinstance(v, np.ndarray):  # nothing is compiled
-        middle = np.reshape(
-            [_middle(record) for record in v.reshape(-1, v.shape[-1])], v.shape[:-1]
-        )
-        return np.asarray(np.maximum(PER_MEDIAN * middle, floor))
-    size = jnp.abs(jnp.diff(v, ORDER)[:: _every(v.shape[0])])
-    return jnp.maximum(PER_MEDIAN * _median(size), floor)
-
-
-def _middle(v: Float[np.ndarray, " time"]) -> float:
-    """The median size of the differences, one of them.
-
-    Only the sizes between two limits are sorted, those around the median of every 16th size. This
-    takes less than half of the time of a partition of all sizes.
-    """
-    sizes = np.abs(np.convolve(v, DIFFERENCE)[ORDER : v.size : _every(v.size)])
-    half = sizes.size // 2
-    sample = np.sort(sizes[::16])
-    reach = round(1.5 * math.sqrt(sample.size))
-    low = sample[max(sample.size // 2 - reach, 0)]
-    high = sample[min(sample.size // 2 + reach, sample.size - 1)]
-    between = np.compress((sizes >= low) & (sizes <= high), sizes)
-    place = half - np.count_nonzero(sizes < low)
-    if not 0 <= place < between.size:  # one record of a thousand, or it is not finite
-        between, place = sizes, half
-    between.partition(place)
-    return float(between[place])
-
-
-def _quietest(v: Float[np.ndarray, " time"]) -> float:
-    """`noise_std` of a record without quiet parts, or the noise at the top of its band.
-
-    The latter if the differences do not change their sign as those of white noise do, and if it is
-    surely smaller.
-    """
-    sigma = float(noise_std(v))
-    signs = np.signbit(np.convolve(v, DIFFERENCE)[ORDER : v.size])
-    changes = [np.count_nonzero(signs[lag:] != signs[:-lag]) / v.size for lag in (1, 2)]
-    if np.abs(np.subtract(changes, CHANGES)).max() < 2.5 / math.sqrt(v.size):
-        return sigma
-    window = np.hanning(v.size)
-    squares = np.abs(np.fft.rfft(v * window)) ** 2 / np.sum(window**2)
-    top = squares[round(0.38 * v.size) :]
-    if top.size == 0:
-        return sigma
-    found = math.sqrt(float(np.median(top)) / math.log(2))
-    # The median of n such powers has a relative error of 1.44/√n, its root of half of it.
-    return found if found < (1 - 8 * 0.72 / math.sqrt(top.size)) * sigma else sigma
-
-
-def _every(samples: int) -> int:
-    """Step from one difference to the next."""
-    return 2 if samples > 30_000 else 1
 
 
 class Measurement(Module):
@@ -454,9 +279,23 @@ class Measurement(Module):
     sample_rate: Float[Array, "*lane"]
 
 
+def floor(
+    v: Float[Array | np.ndarray, "*record time"],
+    resolution: Float[Array | np.ndarray, "*record"],
+) -> Float[Array | np.ndarray, "*record"]:
+    """Least noise of records, in their unit: rounding by the converter, and the interpolation.
+
+    Args:
+        v: Samples of the records, or their smallest and largest sample.
+        resolution: Step of the converter; 0 if it is not known.
+    """
+    xp = namespace(v)
+    return xp.asarray(xp.maximum(resolution / math.sqrt(12.0), RIPPLE * xp.ptp(v, axis=-1)))
+
+
 def noise(
     v: Float[Array | np.ndarray, " time"], resolution: Float[Array | np.ndarray, ""]
 ) -> Float[Array | np.ndarray, ""]:
-    """Noise of a record, in its unit and at least as large as the error of the interpolation."""
+    """White noise of a record, in its unit and at least its `floor`."""
     xp = namespace(v)
-    return xp.asarray(xp.maximum(noise_std(v, resolution), RIPPLE * xp.ptp(v)))
+    return xp.asarray(xp.maximum(noise_std(v), floor(v, resolution)))

@@ -16,8 +16,8 @@ import numpy.typing as npt
 from jaxtyping import Complex, Float
 
 from etid.signals.harmonics import WINDOW, harmonics
-from etid.signals.noise import noise_std
 from etid.signals.quick_looks import shows_few
+from etid.signals.white_noise import noise_std
 
 COARSE = 2.0  # step over noise; at this ratio 0.7 % of the saw-tooth is left
 VISIBLE = 1e-3  # of the signal; other errors hide the saw-tooth of a smaller step
