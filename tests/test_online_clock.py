@@ -5,9 +5,10 @@ import functools
 import numpy as np
 import pytest
 
-from etid.online.clock import Clock, measured_period
+from etid.online.clock import Clock
 from etid.online.stream import Pulses
 from etid.online.tracker import Tracker
+from etid.recordings.preflight import Inspected
 from etid.results.verdicts import verdict_names
 from etid.simulation.transformer import loading
 from tests.skins import off
@@ -77,7 +78,7 @@ def test_an_unloaded_record_of_another_quartz_has_its_own_period():
     record = study["cal/0"].replace(v_th=v[0], v_out=v[1])
     tracker = Tracker.of(driver, record, electrodes=TEN)
     assert tracker.period == pytest.approx(PERIOD * (1 + 1e-6 * ppm), abs=1e-6 * PERIOD)
-    assert measured_period(study["cal/0"].v_th, NOISE, PERIOD) == PERIOD
+    assert Inspected(study["cal/0"]).exact_spacing == PERIOD
 
 
 def blocks(v, size=500):

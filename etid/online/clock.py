@@ -18,7 +18,6 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from etid.online.gain_bands import cut
 from etid.online.pulse_fit import DELAYS
 
 SMOOTH = 0.1  # of the sample rate: a pulse is compared below it, so that its correlation is round
@@ -28,8 +27,6 @@ WANDER = 1e-9  # standard deviation of its change from pulse to pulse
 SPREAD = 0.2  # [samples] of one measurement: noise, and a trigger that jitters
 OFFSET = 0.5  # [samples] by loads, other than the typical one
 BESIDE = 0.6  # [samples] that a pulse may be beside its window; no noise moves windows then
-CUT = 3e-3  # [samples] error of a place where a period is no whole number of samples
-SURE = 5.0  # standard deviations by which a period must differ from what was told
 
 
 class Place:
@@ -40,7 +37,6 @@ class Place:
 
     Attributes:
         samples: Length of a window [samples].
-        slope: Root of the sum of squares of the slope of the pulse that is compared [V/sample].
     """
 
     def __init__(self, pulse: Float[np.ndarray, " sample"]) -> None:
@@ -49,8 +45,6 @@ class Place:
         spectrum = np.fft.rfft(pulse)[self._used]
         self._conjugate = spectrum.conj()
         self._size = np.sqrt(2 * np.sum(np.abs(spectrum) ** 2))
-        turn = 2 * np.pi * np.arange(1, spectrum.size + 1) / pulse.size
-        self.slope = np.sqrt(2 / pulse.size * np.sum((turn * np.abs(spectrum)) ** 2))
 
     def late(self, window: Float[np.ndarray, "lane sample"]) -> float:
         """How much later the pulse is than the typical one [samples]; NaN if there is none."""
@@ -139,25 +133,3 @@ class Clock:
         gain = seen / (seen[0] + seen[2] + SPREAD**2)
         self._state = self._state + gain * off
         self._cov = self._cov - np.outer(gain, seen)
-
-
-def measured_period(v_th: Float[np.ndarray, " time"], sigma: float, period: float) -> float:
-    """The period of an unloaded record, if it is measurably another one than told [samples].
-
-    Windows that are cut by a wrong period smear the pulse, and its aliases most of all.
-
-    Args:
-        v_th: Unloaded voltage; the record begins between two pulses [V].
-        sigma: Standard deviation of the noise of a sample [V].
-        period: The period as it was told [samples].
-    """
-    windows = cut(v_th, period)
-    mean = windows.mean(axis=0)
-    place = Place(mean)
-    late = [round(at * period) + place.late(one[None]) for at, one in enumerate(windows)]
-    number = np.arange(len(windows)) - (len(windows) - 1) / 2
-    squares = np.sum(number**2)
-    found = float(number @ late / squares) if squares > 0 else period
-    # The standard error of a delay is σ / √Σ v'².
-    stderr = np.hypot(sigma / place.slope, CUT) / np.sqrt(max(squares, 1.0))
-    return found if abs(found - period) > SURE * stderr else period

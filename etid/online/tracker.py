@@ -58,7 +58,7 @@ from etid.identify.fitting import known_at
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.online.alarms import limit
-from etid.online.clock import Clock, measured_period
+from etid.online.clock import Clock
 from etid.online.gain_bands import unloaded_bands
 from etid.online.noise import Noise
 from etid.online.projection import Projection
@@ -172,7 +172,7 @@ class Tracker(Overviewed, Kept):
             raise IdentificationError(text, None)
         rate = unloaded.sample_rate
         sigma = float(seen.sigma[0])
-        period = measured_period(np.asarray(seen.v_th), sigma, rate / seen.train.counted)
+        period = seen.exact_spacing
         try:
             bands, projection = unloaded_bands(seen.v_th, sigma, rate, period)
         except ValueError as error:

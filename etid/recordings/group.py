@@ -25,8 +25,8 @@ from etid.signals.noise import Noise, floor, noise_of
 from etid.signals.pulse_train import (
     PulseTrain,
     clocks_apart,
+    exact_spacing,
     lags_of,
-    late,
     pulse_trains,
     rise_time,
 )
@@ -35,7 +35,6 @@ from etid.signals.rounding import VISIBLE, is_coarse, step_of
 
 _Key = TypeVar("_Key", bound=Hashable)
 SEAM = 3  # samples on each side of the joint between two periods
-SURE = 5.0  # [standard errors] a delay of the last period that is not by chance
 BY_CHANCE = 4.0  # [standard deviations] largest difference that noise makes
 
 
@@ -286,16 +285,9 @@ class Group:
         known = self.sample_rate / self.trains[row].counted
         return self._exact.get(row, known)
 
-    def _exactly(self, row: int, periods: int) -> float:
-        """`spacing` by the phases of the first and the last pulse, if they surely differ."""
-        spacing, edges = self.spacing(row), self.trains[row].edges
-        by, error = late(self.quiet[row, 0], int(edges[0]), spacing, periods)
-        # Aliases look like up to 0.05 samples.
-        return spacing + by / (periods - 1) if abs(by) > max(SURE * error, 0.05) else spacing
-
     def _aliased(
         self,
-        found: Complex[np.ndarray, "recording 2 harmonic"],
+        coefficients: Complex[np.ndarray, "recording 2 harmonic"],
         power: Float[np.ndarray, "recording 2 harmonic"],
         periods: int,
         samples: int,
@@ -303,20 +295,26 @@ class Group:
         """Rows whose aliases would leak into their harmonics by more than the noise."""
         if periods < 3 or not separates_aliases(periods, samples) or self._cut > 0:
             return []
-        top = slice(int(0.9 * found.shape[-1]), None)  # where aliases are as large as the signal
-        loud = np.square(np.abs(found[:, 0, top])).mean(-1) / power[:, 0, top].mean(-1)
-        rows = []
+        top = coefficients.shape[-1] * 9 // 10  # from here aliases are as large as the signal
+        loud = np.square(np.abs(coefficients[:, 0, top:])).mean(-1) / power[:, 0, top:].mean(-1)
         middle = samples // periods  # a joint, where pulses must be at rest
         at = np.abs(self.quiet[:, 0, middle] - self.quiet[:, 0].mean(-1))
         loud = np.where(at < 0.1 * np.ptp(self.limits[:, 0], axis=-1), loud, 0.0)
-        for row in np.flatnonzero(loud > 1).tolist():
-            if self.trains[row].spacing is None:
+        known = [
+            (int(train.edges[0]), self.spacing(row))
+            if train.spacing is not None and loud[row] > 1
+            else None
+            for row, train in enumerate(self.trains)
+        ]
+        found = []
+        for pulses, rows in _alike(known).items():
+            if pulses is None:
                 continue
-            self._exact[row] = spacing = self._exactly(row, periods)
-            turns = np.exp(2j * np.pi * spacing * np.arange(periods))
-            if abs(turns.mean()) ** 2 * loud[row] > 0.1:
-                rows.append(row)
-        return rows
+            exact = exact_spacing(_part(self.quiet, rows)[:, 0], *pulses, periods)
+            self._exact.update(zip(rows, exact.tolist(), strict=True))
+            turns = np.exp(2j * np.pi * np.outer(exact, np.arange(periods))).mean(1)
+            found += np.array(rows)[np.abs(turns) ** 2 * loud[rows] > 0.1].tolist()
+        return found
 
 
 def _records(recording: Recording) -> tuple[Samples, Samples]:

@@ -18,7 +18,14 @@ from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, aliases, have_ended, joins_aliases
 from etid.signals.mains import Hum
 from etid.signals.noise import Noise
-from etid.signals.pulse_train import PulseTrain, largest_drift, rise_time, shifted, whole_lag
+from etid.signals.pulse_train import (
+    PulseTrain,
+    exact_spacing,
+    largest_drift,
+    rise_time,
+    shifted,
+    whole_lag,
+)
 
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 
@@ -211,6 +218,14 @@ class Inspected:
     def spacing(self) -> float:
         """Length of a pulse period [samples], from the measured pulse rate."""
         return self.recording.sample_rate / self.pulse_rate
+
+    @property
+    def exact_spacing(self) -> float:
+        """`spacing`, or the length that the phases of the pulses in use surely have [samples]."""
+        if self.train.spacing is None:
+            return self.spacing
+        known = int(self.train.edges[0]), self.spacing, self.periods[0]
+        return float(exact_spacing(self.v_th[None], *known)[0])
 
     @property
     def spectrum(self) -> tuple[np.ndarray, ...]:

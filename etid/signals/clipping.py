@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
-from etid.signals.noise import noise_std
+from etid.signals.white_noise import noise_std
 
 
 def is_clipped(v: Float[np.ndarray, " time"], step: float) -> bool:
@@ -72,9 +72,10 @@ def is_limited(
         sample_rate: Sampling rate [Hz].
     """
     shortest = max(SHORTEST[0] * sample_rate, SHORTEST[1])
-    gain = abs(float(cause @ v)) / float(cause @ cause)
-    for sign in (1.0, -1.0):
-        at = sign * v >= (sign * v).max() - BAND * unit
+    for sign, at in (
+        (1.0, v >= v.max() - BAND * unit),
+        (-1.0, v <= v.min() + BAND * unit),
+    ):
         if np.count_nonzero(at) < shortest:  # nearly all records
             continue
         at &= sign * cause > 0.5 * (sign * cause).max()
@@ -86,6 +87,7 @@ def is_limited(
         ]
         if tops:
             rise, shape = _shape(v, tops)
+            gain = abs(float(cause @ v)) / float(cause @ cause)
             moved = 2 * gain * abs(_shape(cause, tops)[0])
             if (
                 moved > MOVED * unit

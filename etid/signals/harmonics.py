@@ -113,13 +113,13 @@ def harmonics(
     # equal parts of the record, which is shorter.
     parts = math.gcd(periods, samples)
     xp, v = namespace(v), v[..., :samples]
-    folded = v.reshape(*v.shape[:-1], parts, -1).sum(-2) / samples
+    folded = v if parts == 1 else v.reshape(*v.shape[:-1], parts, -1).sum(-2)
     transform = xp.fft.rfft(folded)
     basis, fit = _drift(periods, samples)
     # The transform is linear: the drift needs only the transforms of the powers of time.
     drift = xp.einsum("dp,...p->...d", fit, _sums(v, periods))
     step = periods // parts
-    at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step]
+    at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step] / samples
     # `@` would start BLAS threads for each recording, and these threads wait for each other.
     if xp is np:  # real and imaginary parts are real products
         return at_harmonics - np.einsum("...d,dh->...h", drift, basis.view(float)).view(complex)

@@ -25,6 +25,7 @@ RATE = 2e-3  # relative error of pulse_rate; a larger one is a wrong number, not
 # Relative to the sample rate. Below the first, the drift of the mean is larger than a delay; above
 # the second, aliases are a twentieth of the signal.
 PHASES = 0.005, 0.05
+BY_ALIASES = 0.05  # [samples] delay of the last pulse that aliases may look like
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,25 +144,26 @@ def pulse_trains(
         gaps = np.diff(edges)
         even = gaps.size > 0 and np.ptp(gaps) <= EVEN * gaps.mean()
         several = rows[same]
-        spacings = _spacings(records, several, edges, step, sample_rate) if even else None
-        for number, row in enumerate(several):
-            spacing = None if spacings is None else float(spacings[number])
-            if spacing is not None and not _are_alike(coarse[same[number]], edges, step):
-                spacing = None
+        spacings: list[float | None] = [None] * len(same)
+        if even:
+            found = _spacings(records, several, edges, step, sample_rate)
+            both = zip(found.tolist(), _continue_alike(coarse[same], edges, step), strict=True)
+            spacings = [spacing if continues else None for spacing, continues in both]
+        for row, spacing in zip(several, spacings, strict=True):
             trains[row] = PulseTrain(edges, spacing, size, sample_rate, pulse_rate)
     return trains
 
 
-def _are_alike(
-    coarse: Float[np.ndarray, " place"], edges: Int[np.ndarray, " pulse"], step: int
-) -> bool:
-    """Whether the record continues after the last pulse as after the first one, and before them.
+def _continue_alike(
+    coarse: Float[np.ndarray, "record place"], edges: Int[np.ndarray, " pulse"], step: int
+) -> Bool[np.ndarray, " record"]:
+    """Whether records continue after the last pulse as after the first one, and before them.
 
     Of records that are not alike, the difference has twice the mean power of both, or more.
     """
     late = (int(edges[-1]) - int(edges[0])) // step
-    first, last = coarse[:-late], coarse[late:]
-    return bool(np.var(last - first) < 0.5 * (np.var(first) + np.var(last)))
+    first, last = coarse[:, :-late], coarse[:, late:]
+    return np.var(last - first, axis=1) < 0.5 * (np.var(first, axis=1) + np.var(last, axis=1))
 
 
 def _step(period: float) -> int:
@@ -247,33 +249,42 @@ def highest(correlation: Float[np.ndarray, "*record lag"]) -> Float[np.ndarray, 
     return np.asarray(top + beside)
 
 
+def exact_spacing(
+    v: Float[np.ndarray, "record time"], first: int, spacing: float, periods: int
+) -> Float[np.ndarray, " record"]:
+    """`spacing`, or what the phases of the first and the last pulse say if they surely differ."""
+    by, error = late(v, first, spacing, periods)
+    differs = np.abs(by) > np.maximum(SURE * error, BY_ALIASES)
+    return spacing + np.where(differs, by, 0.0) / max(periods - 1, 1)
+
+
 def late(
-    v: Float[np.ndarray, " time"], first: int, spacing: float, periods: int
-) -> tuple[float, float]:
+    v: Float[np.ndarray, "record time"], first: int, spacing: float, periods: int
+) -> tuple[Float[np.ndarray, " record"], Float[np.ndarray, " record"]]:
     """How much later the last pulse is than this spacing says [samples], and its standard error.
 
     It is the slope of the phase between the transforms of the first and the last pulse.
 
     Args:
-        v: The record.
-        first: An edge of its first pulse [samples].
+        v: Records.
+        first: An edge of their first pulse [samples].
         spacing: Length of a period [samples].
         periods: Number of whole periods.
     """
     size = fast_length(int(spacing / 4))
     begin = max(first - size // 4, 0)
     again = begin + round((periods - 1) * spacing)
-    if again + size > v.size:  # the last pulse is cut
-        return 0.0, np.inf
-    pair = np.fft.rfft(np.stack([v[begin : begin + size], v[again : again + size]]))
-    turn = 2 * np.pi * np.arange(pair.shape[1]) / size
+    if again + size > v.shape[1]:  # the last pulse is cut
+        return np.zeros(len(v)), np.full(len(v), np.inf)
+    turn = 2 * np.pi * np.arange(size // 2 + 1) / size
     inside = (turn > 2 * np.pi * PHASES[0]) & (turn < 2 * np.pi * PHASES[1])
-    turn, product = turn[inside], (np.conj(pair[0]) * pair[1])[inside]
+    one, other = (np.fft.rfft(v[:, at : at + size])[:, inside] for at in (begin, again))
+    turn, product = turn[inside], np.conj(one) * other
     phase = np.angle(product * np.exp(-1j * turn * (again - begin - (periods - 1) * spacing)))
     weight = np.abs(product) * turn
     total = weight @ turn
-    found = -(weight @ phase) / total
-    return float(found), float(np.linalg.norm(weight * (phase + found * turn)) / total)
+    found = -np.vecdot(weight, phase) / total
+    return found, np.linalg.norm(weight * (phase + found[:, None] * turn), axis=1) / total
 
 
 # --- Drift of one record against the other --------------------------------------------------------
@@ -397,10 +408,7 @@ def lags_of(
     lags: list[float | None] = [None] * len(records)
     if not trains or records.shape[2] <= rise_time(trains[0].sample_rate):
         return lags
-    alike: dict[_Window, list[int]] = {}
-    for row, train in enumerate(trains):
-        alike.setdefault(_window(records[row, 0], train), []).append(row)
-    for window, rows in alike.items():
+    for window, rows in _windows(records[:, 0], trains).items():
         for row, lag in zip(rows, _lags(records, rows, window), strict=True):
             lags[row] = float(lag) if abs(lag) <= window.largest else None
     return lags
@@ -424,24 +432,38 @@ class _Window(NamedTuple):
     largest: int
 
 
-def _window(v_th: Float[np.ndarray, " time"], train: PulseTrain) -> _Window:
-    """The pulse of `v_th` in the middle of a record, and half a period on both sides.
+def _windows(
+    records: Float[np.ndarray, "record time"], trains: Sequence[PulseTrain]
+) -> dict[_Window, list[int]]:
+    """The records of each window, of unloaded records with equal rates.
 
-    With only one edge of a pulse, the other edge would look like this one with the wrong polarity.
-    Of a whole period, the noise beside the pulse would hide it at 10 dB.
+    A window holds the pulse in the middle of a record, and half a period on both sides. With only
+    one edge of a pulse, the other edge would look like this one with the wrong polarity. Of a whole
+    period, the noise beside the pulse would hide it at 10 dB.
     """
-    period = train.spacing or train.sample_rate / train.pulse_rate
-    rise, edges = rise_time(train.sample_rate), train.edges[train.edges < v_th.size]
-    edge = int(edges[edges.size // 2] if edges.size else np.argmax(np.abs(rises(v_th, rise))))
-    around, step = int(period / 2), _step(period)
-    begin = max(0, edge - around)
-    number = (min(edge + around, v_th.size) - begin) // step
-    coarse = v_th[begin : begin + number * step].reshape(number, step).mean(1)
-    coarse = np.abs(coarse - coarse.mean())
-    high = begin + step * np.flatnonzero(~(coarse < 0.5 * coarse.max()))
-    beside = _room(step, rise)
-    first, last = max(0, high[0] - beside), min(high[-1] + step + beside, v_th.size)
-    return _Window(int(first), int(last), around, rise, min(400, int(period / 4)))
+    size, rise = records.shape[1], rise_time(trains[0].sample_rate)
+    alike: dict[tuple[int, int, int, int], list[int]] = {}
+    for row, train in enumerate(trains):
+        period = train.spacing or train.sample_rate / train.pulse_rate
+        edges = train.edges[train.edges < size]
+        if not edges.size:
+            edges = np.array([np.argmax(np.abs(rises(records[row], rise)))])
+        reach = int(period / 2), min(400, int(period / 4))
+        alike.setdefault((int(edges[edges.size // 2]), _step(period), *reach), []).append(row)
+    windows: dict[_Window, list[int]] = {}
+    for (edge, step, around, largest), rows in alike.items():
+        begin = max(0, edge - around)
+        number = (min(edge + around, size) - begin) // step
+        coarse = records[rows, begin : begin + number * step].reshape(len(rows), number, step)
+        coarse = np.einsum("rps->rp", coarse)
+        coarse = np.abs(coarse - coarse.mean(1, keepdims=True))
+        high = ~(coarse < 0.5 * coarse.max(1, keepdims=True))
+        firsts, lasts = high.argmax(1), number - high[:, ::-1].argmax(1)
+        beside = _room(step, rise)
+        for row, first, last in zip(rows, firsts.tolist(), lasts.tolist(), strict=True):
+            of = max(0, begin + step * first - beside), min(begin + step * last + beside, size)
+            windows.setdefault(_Window(*of, around, rise, largest), []).append(row)
+    return windows
 
 
 def _lags(
