@@ -86,13 +86,18 @@ class Display:
         pulses: First sample and amplitudes of all pulses.
         silent: Whether the converter sends nothing.
         number: Number of the next pulse.
+        again: Whether it is started again: the next pulse has the number 0.
+        begun: How many amplitudes it was sent until it was started again, each time.
+        steps: Number of steps from amplitude 0 to 1, which it tells and to which it rounds; 0 if it
+            gives any amplitude.
         raw: Bytes to send in place of the next block; none: the connection is closed.
         line: The connection.
     """
 
-    def __init__(self, electrodes):
+    def __init__(self, electrodes, steps=0):
         self.skin, self.given, self.pulses = ["dry"] * electrodes, [], []
-        self.silent, self.number = False, 0
+        self.silent, self.number, self.steps = False, 0, steps
+        self.again, self.begun = False, []
         self.raw: bytes | None = None
         self.server = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.server.getsockname()[1]}"
@@ -103,6 +108,8 @@ class Display:
         pulses, noise = alone(), np.random.default_rng(0)
         with self.server, self.server.accept()[0] as line:
             before, self.line = np.zeros(len(self.skin)), line
+            if self.steps:
+                line.sendall(np.array([self.steps, len(self.skin), 0], "<i8").tobytes())
             with contextlib.suppress(ConnectionError):
                 while told := line.recv(8 * before.size, socket.MSG_WAITALL):
                     now = np.frombuffer(told, "<f8")
@@ -115,6 +122,11 @@ class Display:
                         line.sendall(self.raw)
                         self.silent = True
                         continue
+                    if self.again:
+                        self.number, self.again = 0, False
+                        self.begun.append(len(self.given))
+                    if self.steps:
+                        now = np.rint(now * self.steps) / self.steps
                     of = np.stack([pulses[name][self.number % 3] for name in self.skin])
                     v = now[:, None] * of[:, 0] + before[:, None] * of[:, 1]
                     v += NOISE * noise.standard_normal(v.shape)
@@ -457,15 +469,23 @@ def test_a_pause_and_a_counter_that_begins_anew_cost_a_rest_and_stop_is_obeyed_i
         wait_for(lambda: display.positive() > 10)
         display.silent = True
         wait_for(lambda: not display.given[-1].any())
-        display.silent, positive = False, display.positive()
-        wait_for(lambda: display.positive() > positive + 5)
-        assert display.number > PAUSE + 5
-        display.number = 0  # the stimulator was started again
-        wait_for(lambda: not display.given[-1].any())
-        wait_for(lambda: display.given[-1].any())
-        for reason in ("no new amplitude for 0.33 s", "the counter of samples began anew"):
+        display.silent = False
+
+        def alarmed(reason):
             text = f"{reason}: amplitude 0 was sent, and stimulation begins anew from rest"
-            wait_for(lambda text=text: any(text in alarm for alarm in shown(view)["alarms"]))
+            return any(text in alarm for alarm in shown(view)["alarms"])
+
+        wait_for(lambda: alarmed("no new amplitude for 0.33 s"))
+
+        def began_anew():
+            # A counter goes back by a pause. While the display rests, nobody would say so.
+            if display.number > PAUSE + 5 and display.given[-1].any():
+                display.again = True
+            return alarmed("the counter of samples began anew")
+
+        wait_for(began_anew)
+        seen = len(ticks)
+        wait_for(lambda: len(ticks) > seen)
         display.silent = True
         assert json.loads(stop(view)[1]) == {"zero": True}
         wait_for(lambda: not display.given[-1].any(), seconds=5)  # it was sent, and has to be read
@@ -474,6 +494,8 @@ def test_a_pause_and_a_counter_that_begins_anew_cost_a_rest_and_stop_is_obeyed_i
     display.thread.join(30)
     assert not display.given[-1].any()
     assert not any(tick.state.driver_changed for tick in ticks)
+    assert display.begun
+    assert not any(display.given[at].any() for at in display.begun), "0 follows at once"
     given = dict(display.pulses)[round(ticks[-1].number * PERIOD)]
     np.testing.assert_array_equal(ticks[-1].state.electrodes.amplitude, given)
     pulses = [int(tick.state.electrodes.pulses.max()) for tick in ticks]
@@ -518,7 +540,8 @@ ENDS = {
 @pytest.mark.usefixtures("in_the_foreground")
 @pytest.mark.parametrize("how", ENDS)
 def test_the_command_leaves_0_behind_and_says_so(calibration, how, capsys):
-    display = Display(TEN)
+    """The stimulator has 8 bits, so that it would round what is no whole step."""
+    display = Display(TEN, steps=255)
 
     def end():
         try:
@@ -551,6 +574,9 @@ def test_the_command_leaves_0_behind_and_says_so(calibration, how, capsys):
     assert ENDS[how][1] in said
     if how != "hangs up":
         assert not display.given[-1].any()
+    assert any(now.any() for _, now in display.pulses)
+    steps = 255 * np.array(display.given)
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)  # the tracker knows what is given
     if status == DONE:
         assert re.fullmatch(
             rf"\d+ pulses, 0 incomplete, 0 late blocks, \d pauses?, {SENT}\n", printed.out
