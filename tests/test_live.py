@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import http.client
 import itertools
 import json
@@ -55,6 +56,7 @@ WANTED = 80e-9
 SKINS = {**LOADS, "open": ResistorLoad(1e9), "short": ResistorLoad(1.0)}
 
 
+@functools.cache
 def alone():
     """A pulse alone behind each load, and the period after it: (load, phase, 2, sample) [V].
 
