@@ -3,7 +3,8 @@
 One pinned core, samples in ordinary arrays, as many pulses as asked for after a warm-up. The pulses
 differ in noise, trigger delay and sampling phase. filterpy's extended Kalman filter tracks the same
 pulses with the same model in the same run, in an environment of its own (`.rivals`). Then follow
-hum and another quartz (`benchmarks.online_instruments`), false alarms and the detection of wet skin
+hum and another quartz (`benchmarks.online_instruments`), faults that look like a gain
+(`benchmarks.online_faults`), false alarms and the detection of wet skin
 (`benchmarks.online_alarms`).
 """
 
@@ -20,6 +21,7 @@ import etid
 from benchmarks.ladder import BEFORE, WHITE
 from benchmarks.machine import RESULTS
 from benchmarks.online_alarms import LOADS, SOON, Fingertip, alarms
+from benchmarks.online_faults import faults
 from benchmarks.online_instruments import instruments
 from benchmarks.rivals import RivalError, exchange
 from benchmarks.runner import Target, at_least, at_most, option, report
@@ -53,7 +55,7 @@ OPTIONS = (
 
 def main(arguments: argparse.Namespace) -> bool:
     electrodes, hours = arguments.electrodes, arguments.hours
-    found = [*ticks(electrodes, arguments.ticks), *instruments(NOISES[0][0])]
+    found = [*ticks(electrodes, arguments.ticks), *instruments(NOISES[0][0]), *faults()]
     for snr_db, noise in NOISES if hours > 0 else ():
         counts = alarms(electrodes, snr_db, hours, noise).items()
         at = f"{snr_db:g} dB{'' if noise == WHITE else f', {noise}'}: "

@@ -19,6 +19,7 @@ from benchmarks import (
     curves,
     online,
     online_alarms,
+    online_faults,
     online_instruments,
     peers,
     scale,
@@ -96,6 +97,7 @@ SMALLER = {
     amplitudes: {"FINER": (4,), "REPEATS": 1},
     curves: {"LANES": (1, 2), "SAMPLES": (1_000,)},
     online_instruments: {"PULSES": 4},
+    online_faults: {"LANES": 4, "DRIVERS": 1, "SNR": (60.0,)},
     online: {"WARM": 3, "NOISES": ((60.0, "before_the_filter"),), "KINDS": 3},
     online_alarms: {"TIMES": 1},
     selection: {
