@@ -304,8 +304,8 @@ def clocks_apart(
     """How far `v_out` drifts from `v_th` between the first and the last pulse [samples].
 
     Three pulses are compared, the first, one in the middle and the last, of those that have room on
-    both sides. A drift is 0 with fewer pulses, if noise hides it, or if it is not steady: of a lost
-    sample or a disturbed period.
+    both sides. A drift is 0 with fewer pulses, if it is small in all recordings that are alike, if
+    noise hides it, or if it is not steady: of a lost sample or a disturbed period.
 
     Args:
         records: Unloaded and loaded voltage [V] of recordings with equal rates.
@@ -318,29 +318,44 @@ def clocks_apart(
         if train.spacing is not None and lag is not None:
             alike.setdefault((train.edges.tobytes(), round(lag)), []).append(row)
     for (_, late), rows in alike.items():
-        train = trains[rows[0]]
-        rise, step = rise_time(train.sample_rate), _step(train.sample_rate / train.pulse_rate)
-        width, off = _room(step, rise), 2 * step + 2
-        room = train.edges + np.array([[min(late, 0)], [max(late, 0)]])
-        least = step + 1 + off  # an edge is within a step before its coarse place
-        fits = (room[0] >= least) & (room[1] + width + off + rise <= records.shape[2])
-        edges = train.edges[fits]
-        if edges.size < 3:
-            continue
-        first, middle, last = edges[[0, edges.size // 2, -1]].tolist()
-        window = int(min(width, room[0][fits][0] - off)), width
-        moved, error = np.zeros((2, 2, len(rows))), np.zeros((2, len(rows)))
-        for which, by in ((0, 0), (1, late)):
-            for number, later in enumerate((middle, last)):
-                at = first + by, later + by
-                found = _moved(records[:, which], rows, at, window, off, rise)
-                moved[which, number], error[which] = found
-        half, whole = moved[1] - moved[0]
-        steady = np.abs(half - whole * (middle - first) / (last - first)) < STEADY * np.abs(whole)
-        sure = SURE * np.hypot(*(error * sigma[rows].T)) < largest_drift(train.sample_rate)
-        every = (train.edges[-1] - train.edges[0]) / (last - first)
-        apart[rows] = np.where(steady & sure, every * whole, 0.0)
+        apart[rows] = _drifts(records, sigma, rows, trains[rows[0]], late)
     return apart
+
+
+def _drifts(
+    records: Float[np.ndarray, "recording 2 time"],
+    sigma: Float[np.ndarray, "recording 2"],
+    rows: list[int],
+    train: PulseTrain,
+    late: int,
+) -> Float[np.ndarray, " row"]:
+    """`clocks_apart` of recordings with the same edges and the same lag in whole samples."""
+    rise, step = rise_time(train.sample_rate), _step(train.sample_rate / train.pulse_rate)
+    width, off = _room(step, rise), 2 * step + 2
+    room = train.edges + np.array([[min(late, 0)], [max(late, 0)]])
+    least = step + 1 + off  # an edge is within a step before its coarse place
+    fits = (room[0] >= least) & (room[1] + width + off + rise <= records.shape[2])
+    edges = train.edges[fits]
+    if edges.size < 3:
+        return np.zeros(len(rows))
+    first, middle, last = edges[[0, edges.size // 2, -1]].tolist()
+    window = int(min(width, room[0][fits][0] - off)), width
+
+    def drift(later: int) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
+        (of_th, error_th), (of_out, error_out) = (
+            _moved(records[:, which], rows, (first + by, later + by), window, off, rise)
+            for which, by in enumerate((0, late))
+        )
+        return of_out - of_th, np.hypot(error_th * sigma[rows, 0], error_out * sigma[rows, 1])
+
+    whole, error = drift(last)
+    every = (train.edges[-1] - train.edges[0]) / (last - first) * whole
+    largest = largest_drift(train.sample_rate)
+    if (np.abs(every) <= largest).all():  # nearly all recordings
+        return np.zeros(len(rows))
+    half, _ = drift(middle)
+    steady = np.abs(half - whole * (middle - first) / (last - first)) < STEADY * np.abs(whole)
+    return np.where(steady & (SURE * error < largest), every, 0.0)
 
 
 def _moved(
