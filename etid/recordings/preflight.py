@@ -146,7 +146,7 @@ class Inspected:
                 covered = covered | hum.covers(frequency, self.whole_periods[0])
         return covered
 
-    @property
+    @functools.cached_property
     def spans(self) -> Float[np.ndarray, "2"]:
         """Peak-to-peak values of `v_th` and of `v_out` [V]; infinite if they overflow."""
         with quietly():
