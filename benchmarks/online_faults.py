@@ -83,15 +83,16 @@ class Answers(NamedTuple):
     def row(self, of: slice) -> dict[str, Any]:
         """The columns of some lanes."""
         good, z = self.good[:, of], np.abs(self.z[:, of]).max(axis=2)
-        off = np.where(good[..., None], np.abs(self.off[:, of]), 0.0).max(axis=(0, 1))
+        silent, off = good & (z > FAR), np.abs(self.off[:, of])
+        worst = np.where(silent[..., None], off, 0.0).max(axis=(0, 1))
         refused = np.where(good.all(axis=0), np.inf, np.argmin(good, axis=0) + 1)
         return {
             "answers": good.size,
             "successful": int(good.sum()),
-            "silent": int(np.sum(good & (z > FAR))),
+            "silent": int(silent.sum()),
             "largest z": float(np.where(good, z, 0.0).max()),
-            "r_s %": float(100 * off[0]),
-            "r_p %": float(100 * off[1]),
+            "their r_s %": float(100 * worst[0]),
+            "their r_p %": float(100 * worst[1]),
             "half refused at answer": float(np.median(refused)),
         }
 
