@@ -338,5 +338,5 @@ def test_noise_of_bands_is_that_of_their_second_differences():
     real, imaginary = rng.normal(size=(2, 1, 20_000, 6)) * np.sqrt(0.5 / weight)
     gain = real + 1j * imaginary + np.arange(6.0)
     # The mean over the periods is taken from each, which is one degree of freedom less.
-    [found] = _noise_of_single(gain - gain.mean(axis=1, keepdims=True), weight)
+    [found] = _noise_of_single(gain - gain.mean(axis=1, keepdims=True), weight, np.array([19_999]))
     assert found == pytest.approx(0.5, rel=0.02)  # 80 000 differences know it to 0.5 %

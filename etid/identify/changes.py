@@ -129,11 +129,7 @@ def found(
 def _changes(of: Repeats, slopes: np.ndarray, allowed: np.ndarray) -> Change:
     """The changes of recordings with the same number of periods."""
     elements, course = slopes.shape[1], courses(of.gain.shape[1])
-    low, whole, right, plain, unit, total = _equations(of, slopes, course)
-    # The share of each course that aliases cannot imitate.
-    share = 1 - np.abs(np.einsum("cp,lp->lc", course, of.turn.conj())) ** 2
-    share = np.where(share > ALIGNED, share, 0.0)[:, :, None, None]
-    normal = low[:, None] + share * (whole - low)[:, None]
+    whole, normal, right, plain, unit, total = _equations(of, slopes, course)
     tested = elements + 1  # and the amplitude; not the delays
     fitted = _solved(normal, right, tested)
     # Coloured noise differs from period to period too, but not as an element does. The residual of
@@ -174,18 +170,21 @@ def _equations(
     """Normal equations of the elements, the amplitude and the delay.
 
     Returns:
-        Matrix of the bands without aliases; matrix of all bands; right sides for each course,
-        without aliases and with them; units of the parameters, which make the diagonal of the
-        equations 1; Σ η² / variance for each course.
+        Matrix of a course that aliases cannot imitate; matrix of each course; right sides for each
+        course, without aliases and with them; units of the parameters, which make the diagonal of
+        the equations 1; Σ η² / variance for each course.
     """
-    high = of.aliased
     plain = course @ of.gain
-    turn = of.turn.conj()
-    aliased = (turn[:, :, None] * of.gain).sum(1)
-    turned = plain - (turn @ course.T).conj()[:, :, None] * aliased[:, None]
+    along = course @ of.turn.swapaxes(1, 2)
+    lost = np.einsum("lcd,lbde->lcbe", along, of.removed)
+    # The share of each course that aliases cannot imitate, in each band.
+    share = 1 - np.einsum("lcbe,lce->lcb", lost, along.conj()).real
+    share = np.where(share > ALIGNED, share, 0.0)
+    turned = plain - np.einsum("lcbe,leb->lcb", lost, of.turn.conj() @ of.gain)
+    turned = np.where(share > 0, turned, 0.0)
     late = -2j * np.pi * of.frequency / of.sample_rate[:, None]
     # Where aliases are removed, delays along other courses leak into this one.
-    cross = np.where(high & np.any(turn, axis=1, keepdims=True), 1j * late, 0)
+    cross = np.where(np.any(of.removed, axis=(2, 3)), 1j * late, 0)
     nuisance = np.stack([np.ones_like(late), late, cross], axis=1)
     rows = np.concatenate([slopes, nuisance], axis=1)
     # As for the deviations, polynomials are projected out.
@@ -196,11 +195,12 @@ def _equations(
     unit = np.where(unit > 0, unit, 1.0)
     rows = rows / unit[:, :, None]
     weighted = (rows * weight).swapaxes(1, 2)
-    below = np.tile(~high, 2)[:, None]
-    low, whole = np.where(below, rows, 0.0) @ weighted, rows @ weighted
-    deviation = real_parts(np.where(high[:, None], turned, plain))
-    total = (deviation**2 * weight).sum(2)
-    return low, whole, deviation @ weighted, real_parts(plain) @ weighted, unit, total
+    of_bands = rows[:, :, None] * (rows * weight)[:, None]
+    normal = np.tile(share, 2) @ of_bands.reshape(len(rows), -1, rows.shape[2]).swapaxes(1, 2)
+    normal = normal.reshape(*share.shape[:2], rows.shape[1], rows.shape[1])
+    right, deviation = real_parts(turned), np.abs(turned) ** 2 / np.where(share > 0, share, 1.0)
+    total = (deviation / of.variance[:, None]).sum(2)
+    return rows @ weighted, normal, right @ weighted, real_parts(plain) @ weighted, unit, total
 
 
 class _Fitted(NamedTuple):

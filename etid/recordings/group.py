@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from etid.recordings.recording import Recording, Samples, quietly
-from etid.signals.averaging import weighted, weights
+from etid.signals.averaging import PLACES, SURE, Aliases, Periods, left, weighted, weights
 from etid.signals.disturbances import (
     Joint,
     Shifts,
@@ -25,7 +25,6 @@ from etid.signals.noise import Noise, floor, noise_of
 from etid.signals.pulse_train import (
     PulseTrain,
     clocks_apart,
-    exact_spacing,
     lags_of,
     pulse_trains,
     rise_time,
@@ -57,6 +56,7 @@ class Group:
         self.pulse_rate = recordings[0].pulse_rate
         self._spectra: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
         self._exact: dict[int, float] = {}
+        self._aliases: dict[int, tuple[Aliases, Aliases]] = {}
         self._noises: dict[tuple[bool, int, int], Noise] = {}
 
     @functools.cached_property
@@ -266,12 +266,18 @@ class Group:
             found = np.asarray(harmonics(self.quiet, periods, samples))
             noise = self.noise_of_quiet(periods, samples)
             power = np.array(noise.variance)
-            for row in self._aliased(found, power, periods, samples):
+            self._find_aliases(found, power, periods, samples)
+            for row, both in self._aliases.items():
+                if self.whole_periods[row] != (periods, samples):
+                    continue
                 spacing = self.spacing(row)
-                of = weights(spacing % 1, periods)
-                v = weighted(self.quiet[row, :, :samples], spacing, of)
-                found[row] = harmonics(v, periods, samples)
-                power[row] *= periods * float(of @ of)
+                place = np.arange(1.0, power.shape[-1] + 1) * (periods / samples)
+                of_cause = np.interp(PLACES, place, power[row, 0])
+                of = weights(spacing, periods, of_cause, both[0])
+                found[row] = weighted(self.quiet[row, :, :samples], spacing, of)
+                power[row] *= np.interp(place, PLACES, periods * np.square(of).sum(-1))
+                rest = [left(of, spacing, aliases) for aliases in both]
+                power[row] += [np.interp(place, PLACES, one) for one in rest]
             *fields, selected = filled(found, power, self.sample_rate, periods, samples)
             usable = np.repeat(selected[None], len(self.recordings), axis=0)
             of_ends = np.asarray(noise.of_ends).any(axis=1)
@@ -285,36 +291,44 @@ class Group:
         known = self.sample_rate / self.trains[row].counted
         return self._exact.get(row, known)
 
-    def _aliased(
+    def aliases(self, row: int) -> tuple[Aliases, Aliases] | None:
+        """Aliases of both records that differ between their periods; None if there are none."""
+        self.spectra(*self.whole_periods[row])
+        return self._aliases.get(row)
+
+    def _find_aliases(
         self,
-        coefficients: Complex[np.ndarray, "recording 2 harmonic"],
+        found: Complex[np.ndarray, "recording 2 harmonic"],
         power: Float[np.ndarray, "recording 2 harmonic"],
         periods: int,
         samples: int,
-    ) -> list[int]:
-        """Rows whose aliases would leak into their harmonics by more than the noise."""
+    ) -> None:
+        """Find the aliases that leak into the harmonics, and the exact length of their periods."""
         if periods < 3 or not separates_aliases(periods, samples) or self._cut > 0:
-            return []
-        top = coefficients.shape[-1] * 9 // 10  # from here aliases are as large as the signal
-        loud = np.square(np.abs(coefficients[:, 0, top:])).mean(-1) / power[:, 0, top:].mean(-1)
+            return
+        top = slice(int(0.9 * found.shape[-1]), None)  # where aliases are as large as the signal
+        loud = np.square(np.abs(found[:, 0, top])).mean(-1) / power[:, 0, top].mean(-1) - 1
         middle = samples // periods  # a joint, where pulses must be at rest
-        at = np.abs(self.quiet[:, 0, middle] - self.quiet[:, 0].mean(-1))
-        loud = np.where(at < 0.1 * np.ptp(self.limits[:, 0], axis=-1), loud, 0.0)
-        known = [
-            (int(train.edges[0]), self.spacing(row))
-            if train.spacing is not None and loud[row] > 1
-            else None
-            for row, train in enumerate(self.trains)
-        ]
-        found = []
-        for pulses, rows in _alike(known).items():
-            if pulses is None:
+        at = np.abs(self.quiet[:, :, middle] - self.quiet.mean(-1))
+        rests = (at < 0.1 * np.ptp(self.limits, axis=-1)).all(-1)
+        surely = SURE / math.sqrt(found[0, 0, top].size)
+        for row in np.flatnonzero(rests & (loud > surely)).tolist():
+            if self.trains[row].spacing is None or self.whole_periods[row] != (periods, samples):
                 continue
-            exact = exact_spacing(_part(self.quiet, rows)[:, 0], *pulses, periods)
-            self._exact.update(zip(rows, exact.tolist(), strict=True))
-            turns = np.exp(2j * np.pi * np.outer(exact, np.arange(periods))).mean(1)
-            found += np.array(rows)[np.abs(turns) ** 2 * loud[rows] > 0.1].tolist()
-        return found
+            v, known = self.quiet[row, :, :samples], self.spacing(row)
+            spacing = known + Periods.of(v[0], known, periods).longer()
+            of_cause = Periods.of(v[0], spacing, periods).aliases(power[row, 0])
+            if of_cause is None:
+                continue
+            plain = np.full((PLACES.size, periods), 1 / periods)
+            place = np.arange(1.0, power.shape[-1] + 1) * (periods / samples)
+            of_noise = np.interp(PLACES, place, power[row, 0])
+            leak = (left(plain, spacing, of_cause) > 0.1 * of_noise).any()
+            if leak:
+                other = Periods.of(v[1], spacing, periods).aliases(power[row, 1], of_cause)
+                self._aliases[row] = of_cause, other or of_cause
+            if leak or abs(spacing - known) * periods > 0.05:
+                self._exact[row] = spacing
 
 
 def _records(recording: Recording) -> tuple[Samples, Samples]:

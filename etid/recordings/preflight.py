@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from etid.recordings.group import BY_CHANCE, Group, covariance_of
 from etid.recordings.recording import Recording, quietly
 from etid.recordings.remarks import Remark
+from etid.signals.averaging import Aliases
 from etid.signals.clipping import is_clipped, is_command, is_limited
 from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
@@ -232,6 +233,11 @@ class Inspected:
         """The fields of an `etid.signals.harmonics.Spectrum` of both voltages."""
         frequency, *of_rows = self._used.spectra(*self.periods)
         return frequency, *(field[self._place] for field in of_rows)
+
+    @property
+    def aliases(self) -> tuple[Aliases, Aliases] | None:
+        """Aliases of both voltages that differ between the periods; None if there are none."""
+        return self._used.aliases(self._place)
 
     @property
     def noise(self) -> Noise:

@@ -18,7 +18,10 @@ Both are recorded at once, so the module then compares X̄ Y_p − Ȳ X_p, which
 moves. Its projection on X̄ Ȳ, weighted by the noise, is the change of the logarithm of Y / X.
 
 **Aliases** rotate by e^(−j2πδ) if a cut is late by a fraction δ of a sample; the rest does not.
-`turn` is the direction of this rotation. A deviation in this direction proves nothing.
+`turn` is the direction t of this rotation. A deviation in this direction proves nothing: only
+(1 − t tᴴ) η counts. Where the power A² of the aliases is known (`etid.signals.averaging`), those of
+fs + f, which rotate by e^(j2πδ), and those of twice the sample rate have directions, too, and η is
+weighted as if they were noise: by (1 + Σ ρ t tᴴ)⁻¹, ρ = n A²/σ² in a band of n harmonics.
 """
 
 import functools
@@ -55,8 +58,9 @@ class Repeats(NamedTuple):
         smooth: Σ conj(Y) times each polynomial.
         variance: Variance of the real part of a weighted sum of `gain` over the periods, if the
             squares of the weights have the sum 1. The imaginary part has the same variance.
-        turn: Direction of the aliases; its length is 1, or 0 if all cuts have the same delay.
-        aliased: Bands whose aliases may exceed the noise.
+        turn: Directions of the aliases, T, orthogonal to each other; the length of each is 1, or 0
+            if all cuts have the same delay.
+        removed: The part M of these directions that does not count: (1 − Tᴴ M T) η does.
         unloaded: Deviation of the amplitude of V_th.
         unloaded_variance: Variance of `unloaded`, defined as `variance`.
     """
@@ -67,8 +71,8 @@ class Repeats(NamedTuple):
     power: Float[np.ndarray, "*lane band"]
     smooth: Complex[np.ndarray, "*lane polynomial band"]
     variance: Float[np.ndarray, "*lane band"]
-    turn: Complex[np.ndarray, "*lane period"]
-    aliased: Bool[np.ndarray, "*lane band"]
+    turn: Complex[np.ndarray, "*lane direction period"]
+    removed: Complex[np.ndarray, "*lane band direction direction"]
     unloaded: Float[np.ndarray, "*lane period"]
     unloaded_variance: Float[np.ndarray, "*lane"]
 
@@ -169,15 +173,17 @@ def _of_equal_periods(
     layout = bands(sample_rate, pulse_rate, 0.4)
     # Without this shift, a late record would be cut within its pulses.
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
-    own = _deviations(loaded, at, layout, _noise(group, 1, layout))
+    aliased = np.array([one.aliases is not None for one in group])
+    own = _deviations(loaded, at, layout, _noise(group, 1, layout), aliased)
     if group[0].has_current:
         currents = [current for current, _ in records]
-        other = _deviations(currents, at, layout, _noise(group, 0, layout))
-        return _of_currents(sample_rate, layout, own, other)
+        other = _deviations(currents, at, layout, _noise(group, 0, layout), aliased)
+        return _of_currents(group, layout, own, other)
     # Of V_th only the amplitude is wanted. If some of the samples were left out, the aliases of its
     # edges would look like another amplitude in each period: by 1e-3 if every fourth remains.
     low = bands(sample_rate, pulse_rate, 1 / 32)
-    unloaded = _deviations([v_th for v_th, _ in records], at, low, _noise(group, 0, low))
+    v_th = [v_th for v_th, _ in records]
+    unloaded = _deviations(v_th, at, low, _noise(group, 0, low), aliased)
     weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low)
     # Effect of an amplitude change by 1 after the projection of the polynomials.
     unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power
@@ -193,8 +199,8 @@ def _of_equal_periods(
     # Because cuts fall between samples, the amplitude differs by 1e-4 for 133 samples of a pulse,
     # by 0.03 for 8 samples.
     variance = noise / total + (2 / np.square(width)) ** 2
-    turn, aliased = _turn(own.late), _aliased(group, layout)
-    parts = own.gain, own.power, smooth, own.variance, turn, aliased, amplitude, variance
+    turn, removed = _directions(own.late, group, layout)
+    parts = own.gain, own.power, smooth, own.variance, turn, removed, amplitude, variance
     return _rows(sample_rate, layout, parts)
 
 
@@ -205,16 +211,47 @@ def _rows(sample_rate: float, layout: Bands, parts: tuple[np.ndarray, ...]) -> l
     return [Repeats(frequency, rate, *of_row) for of_row in zip(*parts, strict=True)]
 
 
-def _turn(late: Float[np.ndarray, "lane period"]) -> Complex[np.ndarray, "lane period"]:
-    """Direction of the aliases of cuts with these delays [samples]."""
-    turn = np.exp(-2j * np.pi * late)
-    turn -= turn.mean(1, keepdims=True)
-    size = np.linalg.norm(turn, axis=1, keepdims=True)
-    return np.where(size > ALIGNED, turn / np.maximum(size, ALIGNED), 0)
+def _directions(
+    late: Float[np.ndarray, "lane period"], group: Sequence[Inspected], layout: Bands
+) -> tuple[
+    Complex[np.ndarray, "lane direction period"],
+    Complex[np.ndarray, "lane band direction direction"],
+]:
+    """`Repeats.turn` and `Repeats.removed` for cuts with these delays [samples]."""
+    turns, basis = _rotations(late)
+    count = basis.shape[2]
+    removed = np.zeros((len(group), layout.middle.size, count, count), complex)
+    for row, one in enumerate(group):
+        if one.aliases is None:
+            basis[row, :, 1:] = 0
+            removed[row, :, 0, 0] = _aliased(one, layout) & basis[row].any()
+            continue
+        place = layout.middle / (2 * np.pi)
+        y = one.aliases[1].at(place)[:2]
+        noise = _in_bands(one, layout, np.asarray(one.noise.variance[1]))
+        ratio = np.repeat(y * layout.number / (len(late[row]) * noise), 2, axis=0)
+        inside = basis[row].conj().T @ turns[row]
+        of_aliases = np.einsum("ak,kb,ck->bac", inside, ratio, inside.conj())
+        removed[row] = np.eye(count) - np.linalg.inv(np.eye(count) + of_aliases)
+    return basis.swapaxes(1, 2), removed
+
+
+def _rotations(
+    late: Float[np.ndarray, "lane period"],
+) -> tuple[Complex[np.ndarray, "lane period alias"], Complex[np.ndarray, "lane period direction"]]:
+    """How aliases rotate with these delays [samples], without the mean, and an orthonormal basis.
+
+    They are those of fs − f, fs + f, 2 fs − f and 2 fs + f.
+    """
+    turns = np.exp(-2j * np.pi * np.array([1, -1, 2, -2]) * late[:, :, None])
+    turns -= turns.mean(1, keepdims=True)
+    basis, by = np.linalg.qr(turns)
+    size = np.abs(np.diagonal(by, axis1=1, axis2=2))
+    return turns, np.where((size > ALIGNED)[:, None], basis, 0)
 
 
 def _of_currents(
-    sample_rate: float, layout: Bands, own: "_Deviations", other: "_Deviations"
+    group: Sequence[Inspected], layout: Bands, own: "_Deviations", other: "_Deviations"
 ) -> list[Repeats]:
     """Deviations of the quotients of voltage and current."""
     pairs = []
@@ -240,9 +277,10 @@ def _of_currents(
         gain.append(np.add.reduceat(rest * mean[row].conj(), layout.edges, axis=1) / power[row])
         smooth.append(np.add.reduceat(mean[row].conj() * basis, layout.edges, axis=1))
     none = np.zeros(own.late.shape)  # an amplitude that changes in both records does no harm
-    parts = np.stack(gain), power, np.stack(smooth), 1 / power, _turn(own.late)
-    aliased = np.tile(layout.middle > 2 * np.pi * ALIASES, (len(none), 1))
-    return _rows(sample_rate, layout, (*parts, aliased, none, np.ones(len(none))))
+    turn, removed = _directions(own.late, group, layout)
+    parts = np.stack(gain), power, np.stack(smooth), 1 / power, turn, removed
+    rate = group[0].recording.sample_rate
+    return _rows(rate, layout, (*parts, none, np.ones(len(none))))
 
 
 def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
@@ -264,17 +302,19 @@ def _turned(v_out: Float[np.ndarray, " time"], of: Inspected) -> Float[np.ndarra
     return np.roll(v_out[: of.periods[1]], -of.lag) if of.lag else v_out
 
 
-def _aliased(group: Sequence[Inspected], layout: Bands) -> Bool[np.ndarray, "lane band"]:
-    """`Repeats.aliased`: above `ALIASES`, and where what continues V_out beyond is too large.
+def _aliased(one: Inspected, layout: Bands) -> Bool[np.ndarray, " band"]:
+    """Bands whose aliases may exceed the noise.
 
-    Aliases of the n harmonics of a band add up, noise does not.
+    Those above `ALIASES`, and those where what continues V_out beyond is too large. Aliases of the
+    n harmonics of a band add up, noise does not.
     """
-    found = []
-    for one in group:
-        _, _, y, _, variance, _ = one.spectrum
-        ratio = np.asarray(aliases(y, variance, *one.periods).power / variance)
-        found.append(_in_bands(one, layout, ratio) * layout.number > 0.1)
-    return np.stack(found) | (layout.middle > 2 * np.pi * ALIASES)
+    high = layout.middle > 2 * np.pi * ALIASES
+    if one.has_current:
+        return high
+    variance = np.asarray(one.noise.variance[1])
+    y = one.spectrum[2][: variance.size]
+    ratio = np.asarray(aliases(y, variance, *one.periods).power / variance)
+    return high | (_in_bands(one, layout, ratio) * layout.number > 0.1)
 
 
 def _noise(
@@ -283,8 +323,7 @@ def _noise(
     """Variance of the real part of a harmonic of one period, in each band of one of the records."""
     found = []
     for one in group:
-        *_, variance_x, variance_y, _ = one.spectrum
-        variance = _in_bands(one, layout, (variance_x, variance_y)[record])
+        variance = _in_bands(one, layout, np.asarray(one.noise.variance[record]))
         found.append(variance * one.periods[1] * (layout.length / 2))
     return np.stack(found)
 
@@ -294,7 +333,7 @@ def _in_bands(
 ) -> Float[np.ndarray, " band"]:
     """Values at the harmonics of a recording, at the centre of each band."""
     angle = one.spectrum[0] * (2 * np.pi / one.recording.sample_rate)
-    return np.interp(layout.middle, angle, values)
+    return np.interp(layout.middle, angle[: values.size], values)
 
 
 class _Deviations(NamedTuple):
@@ -313,8 +352,12 @@ def _deviations(
     at: Float[np.ndarray, "lane period"],
     layout: Bands,
     least: Float[np.ndarray, "lane band"],
+    aliased: Bool[np.ndarray, " lane"],
 ) -> "_Deviations":
-    """Deviations of the periods with the starts `at` [samples] and at least this `_noise`."""
+    """Deviations of the periods with the starts `at` [samples] and at least this `_noise`.
+
+    The starts are exact for records whose aliases are known (`aliased`).
+    """
     periods = at.shape[1]
     last = np.array([v.size - layout.length for v in records])
     starts = np.minimum(np.rint(at), last[:, None]).astype(int)  # samples at which periods are cut
@@ -333,39 +376,49 @@ def _deviations(
         slope = more @ line
         by_line = np.abs(slope) > surely
         singly = np.abs(more).max(1) > 1.5 * surely
-        moved = by_line | singly
+        moved = (by_line | singly) & ~aliased
         if not moved.any():
             break
-        late = late + np.where(singly[:, None], more, np.where(by_line, slope, 0)[:, None] * line)
+        line_of = np.where(by_line, slope, 0)[:, None] * line
+        late = late + np.where(aliased[:, None], 0, np.where(singly[:, None], more, line_of))
         again = _compared(raw[moved], late[moved], layout)
         for whole, part in zip((power, mean, weight, gain), again, strict=True):
             whole[moved] = part
-    # The part that no change of the gain explains is noise.
-    rest = np.add.reduceat(power, layout.edges, axis=1) - weight * _power(gain).sum(1)
-    freedom = 2 * (layout.number - 1) * (periods - 1)
+    # The part that no change of the gain explains is noise, or aliases.
+    left, quiet = np.full(len(raw), periods - 1), gain
+    if aliased.any():
+        turn = _rotations(late[aliased])[1][..., : periods - 2]
+        left[aliased] -= turn.any(1).sum(1)
+        power[aliased], _, _, of_rest = _compared(raw[aliased], late[aliased], layout, turn)
+        quiet = gain.copy()
+        quiet[aliased] = of_rest
+    rest = np.add.reduceat(power, layout.edges, axis=1) - weight * _power(quiet).sum(1)
+    freedom = 2 * (layout.number - 1) * left[:, None]
     plain = layout.middle < 2 * np.pi * PLAIN
-    excess = (rest / least)[:, plain].sum(1) / max(freedom[plain].sum(), 1)
+    excess = (rest / least)[:, plain].sum(1) / np.maximum(freedom[:, plain].sum(1), 1)
     overall = np.maximum(excess, 1.0)[:, None] * least
     freedom = np.maximum(freedom, 1)
     sure = rest > overall * (freedom + SURE * np.sqrt(2 * freedom))
     noise = np.where(sure & (layout.number > 1), rest / freedom, overall)
     single = np.count_nonzero(layout.number == 1)
     if single > 2:
-        low = _noise_of_single(gain[:, :, :single], (weight / overall)[:, :single])
-        sure = low > 1 + SURE * math.sqrt(2 / ((single - 2) * (periods - 1)))
+        low = _noise_of_single(quiet[:, :, :single], (weight / overall)[:, :single], left)
+        sure = low > 1 + SURE * np.sqrt(2 / ((single - 2) * left))
         noise[:, :single] = np.where(sure, low, 1.0)[:, None] * overall[:, :single]
     return _Deviations(gain, weight, noise / weight, mean, late, raw)
 
 
-def _noise_of_single(gain: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Noise of the bands of one harmonic relative to 1/weight.
+def _noise_of_single(
+    gain: np.ndarray, weight: np.ndarray, left: Int[np.ndarray, " lane"]
+) -> np.ndarray:
+    """Noise of the bands of one harmonic relative to 1/weight, of so many deviations.
 
     It is found from second differences between these bands. A change of the load is smooth over the
     first harmonics; coloured noise is not.
     """
     bend = gain[:, :, :-2] - 2 * gain[:, :, 1:-1] + gain[:, :, 2:]
     spread = 1 / weight[:, :-2] + 4 / weight[:, 1:-1] + 1 / weight[:, 2:]
-    freedom = 2 * (gain.shape[1] - 1) * bend.shape[2]
+    freedom = 2 * left * bend.shape[2]
     return (_power(bend) / spread[:, None, :]).sum((1, 2)) / freedom
 
 
@@ -393,14 +446,23 @@ def _transforms(
 
 
 def _compared(
-    raw: np.ndarray, late: Float[np.ndarray, "lane period"], layout: Bands
+    raw: np.ndarray,
+    late: Float[np.ndarray, "lane period"],
+    layout: Bands,
+    turn: Complex[np.ndarray, "lane period direction"] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Power of the deviations, mean, its power, and `gain`, for periods with these delays."""
+    """Power of the deviations, mean, its power, and `gain`, for periods with these delays.
+
+    Deviations in the directions `turn` are removed.
+    """
     # Most recordings of a batch are cut alike.
     alike = late[:1] if (late == late[0]).all() else late
     deviation = raw * _turns(alike * (2 * np.pi / layout.size), raw.shape[2])
     mean = np.einsum("lpk->lk", deviation) / raw.shape[1]  # faster than `mean`
     deviation -= mean[:, None, :]
+    if turn is not None:
+        along = turn.astype(np.complex64)
+        deviation -= along @ (along.conj().swapaxes(1, 2) @ deviation)
     deviation = _without(deviation, layout.polynomials)
     weight = np.maximum(np.add.reduceat(_power(mean), layout.edges, axis=1).astype(float), TINY)
     parts = deviation.view(np.float32)

@@ -109,21 +109,36 @@ def harmonics(
 
     The drift of the mean from period to period is removed. Two records at once take as long as one.
     """
-    # Only bins that are multiples of `parts` are needed. They are the bins of the sum of so many
-    # equal parts of the record, which is shorter.
-    parts = math.gcd(periods, samples)
     xp, v = namespace(v), v[..., :samples]
-    folded = v if parts == 1 else v.reshape(*v.shape[:-1], parts, -1).sum(-2)
-    transform = xp.fft.rfft(folded)
-    basis, fit = _drift(periods, samples)
+    at_harmonics = harmonics_of(v, periods)
+    basis, fit, _ = _drift(periods, samples)
     # The transform is linear: the drift needs only the transforms of the powers of time.
     drift = xp.einsum("dp,...p->...d", fit, _sums(v, periods))
-    step = periods // parts
-    at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step] / samples
     # `@` would start BLAS threads for each recording, and these threads wait for each other.
     if xp is np:  # real and imaginary parts are real products
         return at_harmonics - np.einsum("...d,dh->...h", drift, basis.view(float)).view(complex)
     return at_harmonics - jnp.einsum("...d,dh->...h", drift.astype(basis.dtype), basis)
+
+
+def harmonics_of(
+    v: Float[Array | np.ndarray, "*record time"], periods: int
+) -> Complex[Array | np.ndarray, "*record harmonic"]:
+    """`harmonics` of records of whole periods, with their drift."""
+    # Only bins that are multiples of `parts` are needed. They are the bins of the sum of so many
+    # equal parts of the record, which is shorter.
+    samples = v.shape[-1]
+    parts = math.gcd(periods, samples)
+    folded = v if parts == 1 else v.reshape(*v.shape[:-1], parts, -1).sum(-2)
+    step = periods // parts
+    transform = namespace(v).fft.rfft(folded)
+    return transform[..., step : (folded.shape[-1] + 1) // 2 : step] / samples
+
+
+def flat(v: Float[np.ndarray, "*record time"], periods: int) -> Float[np.ndarray, "*record time"]:
+    """Records of whole periods without the drift of the mean that `harmonics` removes."""
+    _, fit, powers = _drift(periods, v.shape[-1])
+    drift = np.einsum("dp,...p->...d", fit, _sums(v, periods))
+    return v - np.einsum("...d,td->...t", drift, powers)
 
 
 def real_parts(values: Values) -> Values:
@@ -144,12 +159,17 @@ def _sums(v: Array | np.ndarray, periods: int) -> Array | np.ndarray:
 @functools.lru_cache(maxsize=64)
 def _drift(
     periods: int, samples: int
-) -> tuple[Complex[np.ndarray, "degree harmonic"], Float[np.ndarray, "degree period"]]:
-    """Transforms of the powers of time, and the matrix from period sums to coefficients."""
+) -> tuple[
+    Complex[np.ndarray, "degree harmonic"],
+    Float[np.ndarray, "degree period"],
+    Float[np.ndarray, "time degree"],
+]:
+    """Transforms of the powers of time, the matrix from period sums to coefficients, the powers."""
     powers = np.vander(np.linspace(-1, 1, samples), min(periods, DRIFT_DEGREE + 1), increasing=True)
     transforms = np.fft.rfft(powers, axis=0) / samples
     fit = np.linalg.pinv(np.asarray(_sums(powers.T, periods)).T)
-    return np.ascontiguousarray(transforms[periods : (samples + 1) // 2 : periods].T), fit
+    at_harmonics = transforms[periods : (samples + 1) // 2 : periods]
+    return np.ascontiguousarray(at_harmonics.T), fit, powers
 
 
 def local_sum(values: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
