@@ -12,6 +12,7 @@ import etid
 from benchmarks.noise import Flicker
 from etid.signals.harmonics import harmonics, whole_periods
 from etid.signals.noise import noise_of
+from etid.signals.quiet_parts import BLOCKS, EDGE, window_of
 from tests.conftest import REFERENCE_DATA
 
 RATE, PULSES, SIGMA = 200e3, 60.0, 0.01
@@ -130,6 +131,23 @@ def test_the_noise_of_a_sample_is_that_in_the_middle_behind_a_low_filter(order):
     true = SIGMA * np.sqrt(np.mean(np.abs(scipy.signal.sosfreqz(sos, frequency, fs=RATE)[1]) ** 2))
     # Of 7 800 powers, 0.6 %; bands of 12 to 50 of them are enlarged by 1 to 4 %.
     assert np.mean(found) == pytest.approx(1.02 * true, rel=0.03)
+
+
+@pytest.mark.parametrize("loud", [[3], [0, 1, 70], [127, 40]])
+def test_the_window_leaves_the_quiet_parts_of_each_period(loud):
+    """It is smooth: kinks would bring aliases of the tail between the harmonics."""
+    samples, periods = 3 * 3840, 3  # 30 samples of each part
+    parts = np.zeros((1, BLOCKS), bool)
+    parts[:, loud] = True
+    (window,) = window_of(parts, periods, samples).reshape(1, periods, -1)
+    np.testing.assert_allclose(window[1:], window[[0]].repeat(2, axis=0), atol=1e-12)
+    away = np.abs(np.subtract.outer(np.arange(BLOCKS), loud))
+    away = np.minimum(away, BLOCKS - away).min(1).repeat(30)
+    assert not window[0, away == 0].any()
+    np.testing.assert_allclose(window[0, away > 2 * EDGE], 1.0, atol=1e-12)
+    # A cosine that rises over 16 parts bends by 2π/480² from sample to sample; lines by 5 % more.
+    bend = np.abs(np.diff(window[0], 2))
+    assert bend.max() < 1.1 * 2 * np.pi / 480**2
 
 
 def test_a_burst_in_one_period_does_not_hide_itself():

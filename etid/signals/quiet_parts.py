@@ -95,7 +95,7 @@ _SHARES = _rise(_AWAY + 0.5) - _rise(_AWAY - 0.5)
 def _window(
     loud: Bool[Array | np.ndarray, "*record part"], periods: int, samples: int
 ) -> Float[Array | np.ndarray, "*record time"]:
-    """0 in and beside loud parts, 1 from 2 `EDGE` parts beside them."""
+    """0 in loud parts, 1 from 2 `EDGE` parts beside them, and a raised cosine between."""
     xp, places = namespace(loud), _places(periods, samples)
     far = xp.where(loud[..., _NEAR[:, :-1]].any(-1), 0.0, 1.0)
     points = (far[..., _NEAR] @ _SHARES).reshape(*loud.shape[:-1], -1)
