@@ -7,8 +7,10 @@ import pytest
 from scipy.signal import czt
 
 import etid
+from etid.recordings.preflight import Inspected
 from etid.signals.averaging import PLACES, Aliases, Periods, left, weighted, weights
 from etid.signals.harmonics import harmonics
+from etid.simulation.scenes import Electronics
 from tests.skins import off
 
 RATE, PULSES = 200e3, 60.0
@@ -117,3 +119,13 @@ def test_without_a_filter_nothing_is_lost_with_much_noise_nor_refused_with_littl
         # over six periods has up to 1.1 times the variance.
         stderr = np.array(list(fit.stderr.values()))
         assert (stderr < 1.25 * np.array(list(etid.bound(scene)[path].stderr.values()))).all()
+
+
+def test_a_steep_filter_leaves_no_aliases_where_the_clocks_agree():
+    """The noise hides how fast the spectrum falls behind the filter, not that it falls."""
+    scene = etid.scenes.paper_dry(
+        electronics=Electronics(filter_order=7), antialias=0.37, snr_db=50.0, samples=20_100
+    )
+    scene = dataclasses.replace(scene, trials=scene.trials[:3])
+    for one in scene.simulate(seed=0).loaded.recordings():
+        assert Inspected(one).aliases is None

@@ -32,10 +32,10 @@ from etid.signals.pulse_train import PHASES, fast_length
 
 SEAM = 4  # samples on each side of the joint between two periods
 PLACES = np.linspace(0.0, 0.5, 6)  # of the sample rate, where weights are found
-PAIRS = np.arange(1, 4)  # multiples k of the sample rate whose aliases count
+PAIRS = np.arange(1, 3)  # multiples k of the sample rate whose aliases count
 # Parts of the band, relative to the sample rate, that show aliases.
 UPPER, LOWER = (0.4, 0.5), (0.1, 0.35)
-FALLS = np.linspace(2.0, 16.0, 29)  # from that of edges to that behind a filter
+FALLS = np.linspace(2.0, 30.0, 57)  # from that of edges to that behind a filter
 SURE = 4.0  # [standard errors] of a power that is not by chance
 CLEAR = 40.0  # [standard errors] of about half the noise, which is itself known to 3 %
 TOLD = 0.1  # part of a delay that must be told from aliases
