@@ -19,7 +19,13 @@ from etid.signals.disturbances import (
     of_source,
     shifts,
 )
-from etid.signals.harmonics import filled, harmonics, separates_aliases, whole_periods
+from etid.signals.harmonics import (
+    COHERENT,
+    filled,
+    harmonics,
+    separates_aliases,
+    whole_periods,
+)
 from etid.signals.mains import Hum, separated
 from etid.signals.noise import Noise, floor, noise_of
 from etid.signals.pulse_train import (
@@ -34,6 +40,8 @@ from etid.signals.rounding import VISIBLE, is_coarse, step_of
 
 _Key = TypeVar("_Key", bound=Hashable)
 SEAM = 3  # samples on each side of the joint between two periods
+MOVED = 0.05  # [samples] of the last period, from which on its place matters without aliases
+LEAK = 0.1  # part of the noise that aliases on a harmonic may have
 BY_CHANCE = 4.0  # [standard deviations] largest difference that noise makes
 
 
@@ -298,7 +306,7 @@ class Group:
 
     def _find_aliases(
         self,
-        found: Complex[np.ndarray, "recording 2 harmonic"],
+        coefficients: Complex[np.ndarray, "recording 2 harmonic"],
         power: Float[np.ndarray, "recording 2 harmonic"],
         periods: int,
         samples: int,
@@ -306,28 +314,34 @@ class Group:
         """Find the aliases that leak into the harmonics, and the exact length of their periods."""
         if periods < 3 or not separates_aliases(periods, samples) or self._cut > 0:
             return
-        top = slice(int(0.9 * found.shape[-1]), None)  # where aliases are as large as the signal
-        loud = np.square(np.abs(found[:, 0, top])).mean(-1) / power[:, 0, top].mean(-1) - 1
+        top = coefficients[:, 0, coefficients.shape[-1] * 9 // 10 :]  # aliases are as large there
+        loud = np.square(np.abs(top)).mean(-1) / power[:, 0, -top.shape[-1] :].mean(-1) - 1
         middle = samples // periods  # a joint, where pulses must be at rest
         at = np.abs(self.quiet[:, :, middle] - self.quiet.mean(-1))
         rests = (at < 0.1 * np.ptp(self.limits, axis=-1)).all(-1)
-        surely = SURE / math.sqrt(found[0, 0, top].size)
+        surely = SURE / math.sqrt(top.shape[-1])
         for row in np.flatnonzero(rests & (loud > surely)).tolist():
             if self.trains[row].spacing is None or self.whole_periods[row] != (periods, samples):
                 continue
             v, known = self.quiet[row, :, :samples], self.spacing(row)
-            spacing = known + Periods.of(v[0], known, periods).longer()
-            of_cause = Periods.of(v[0], spacing, periods).aliases(power[row, 0])
-            if of_cause is None:
+            of_cause = Periods.of(v[0], known, periods)
+            spacing = known + of_cause.longer()
+            of_cause = of_cause._replace(spacing=spacing)
+            if abs(spacing - known) * periods > MOVED:
+                self._exact[row] = spacing
+            # At most, aliases are as large as the signal where they meet it.
+            kept = np.square(np.abs(of_cause.turns.mean(1))).sum()
+            if 2 * COHERENT * spacing * loud[row] * kept < LEAK:
+                continue
+            found = of_cause.aliases(power[row, 0])
+            if found is None:
                 continue
             plain = np.full((PLACES.size, periods), 1 / periods)
             place = np.arange(1.0, power.shape[-1] + 1) * (periods / samples)
             of_noise = np.interp(PLACES, place, power[row, 0])
-            leak = (left(plain, spacing, of_cause) > 0.1 * of_noise).any()
-            if leak:
-                other = Periods.of(v[1], spacing, periods).aliases(power[row, 1], of_cause)
-                self._aliases[row] = of_cause, other or of_cause
-            if leak or abs(spacing - known) * periods > 0.05:
+            if (left(plain, spacing, found) > LEAK * of_noise).any():
+                other = Periods.of(v[1], spacing, periods).aliases(power[row, 1], found)
+                self._aliases[row] = found, other or found
                 self._exact[row] = spacing
 
 

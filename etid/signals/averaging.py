@@ -25,7 +25,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from etid.signals.harmonics import COHERENT, flat, harmonics_of
 from etid.signals.pulse_train import PHASES, fast_length
@@ -64,29 +64,42 @@ class Periods(NamedTuple):
     """The transforms of the periods of a record.
 
     Attributes:
-        of_each: Coefficients of each period, as if it began at its place.
+        of_each: Coefficients of each period, as it was cut.
         place: Their frequencies, relative to the sample rate.
-        turns: How the aliases of `PAIRS` are turned in each period.
+        starts: Samples at which the periods are cut.
+        spacing: Length of a period [samples].
     """
 
     of_each: Complex[np.ndarray, "period place"]
     place: Float[np.ndarray, " place"]
-    turns: Complex[np.ndarray, "pair period"]
+    starts: Int[np.ndarray, " period"]
+    spacing: float
 
     @classmethod
     def of(cls, v: Float[np.ndarray, " time"], spacing: float, periods: int) -> "Periods":
         """The periods of a record, whose length is `spacing` [samples]."""
         length = int(spacing) - 1
-        begins = np.arange(periods) * spacing
-        starts = np.minimum(np.rint(begins).astype(int), v.size - length)
+        starts = np.rint(np.arange(periods) * spacing).astype(int)
+        starts = np.minimum(starts, v.size - length)
         cut = v[starts[:, None] + np.arange(length)]
         first, last = cut[:, [0, -1]].mean(0)
         cut = cut - first - (last - first) * np.linspace(0, 1, length)
         size = fast_length(length)
         place = np.arange(size // 2 + 1) / size
-        of_each = np.fft.rfft(cut, size) / spacing
-        of_each *= np.exp(-2j * np.pi * np.outer(starts - begins, place))
-        return cls(of_each, place, _turns(spacing, periods))
+        return cls(np.fft.rfft(cut, size) / spacing, place, starts, spacing)
+
+    @property
+    def turns(self) -> Complex[np.ndarray, "pair period"]:
+        """How the aliases of `PAIRS` are turned in each period."""
+        return _turns(self.spacing, len(self.starts))
+
+    def _part(
+        self, low: float, high: float
+    ) -> tuple[Complex[np.ndarray, "period place"], Float[np.ndarray, " place"]]:
+        """Coefficients of each period in a part of the band, as if it began at its place."""
+        inside = (self.place >= low) & (self.place < high)
+        late, place = self.starts - self.spacing * np.arange(len(self.starts)), self.place[inside]
+        return self.of_each[:, inside] * np.exp(-2j * np.pi * np.outer(late, place)), place
 
     def longer(self) -> float:
         """By how much a period is longer than was said [samples].
@@ -94,16 +107,14 @@ class Periods(NamedTuple):
         A longer period turns the phases of each period more. Aliases of the first pair do not
         count, unless there are too few periods to tell them.
         """
-        line = np.arange(len(self.of_each)) - (len(self.of_each) - 1) / 2
+        line = np.arange(len(self.starts)) - (len(self.starts) - 1) / 2
         plain, turn = np.ones(line.size), self.turns[0]
         apart = _without(line, plain, turn.real, turn.imag)
         if apart @ apart < TOLD * (line @ line):
             apart = line
-        inside = (self.place > PHASES[0]) & (self.place < PHASES[1])
-        of_each, place = self.of_each[:, inside], self.place[inside]
+        of_each, place = self._part(*PHASES)
         slope = -2j * np.pi * place * of_each.mean(0) * (apart @ line)
-        moved = apart @ of_each
-        return float(np.vdot(slope, moved).real / np.vdot(slope, slope).real)
+        return float(np.vdot(slope, apart @ of_each).real / np.vdot(slope, slope).real)
 
     def aliases(
         self, noise: Float[np.ndarray, " harmonic"], like: Aliases | None = None
@@ -132,8 +143,7 @@ class Periods(NamedTuple):
         self, noise: Float[np.ndarray, " harmonic"], part: tuple[float, float]
     ) -> tuple[float, float]:
         """Mean power of the aliases in a part of the band, and its standard error."""
-        count, (low, high) = len(self.of_each), part
-        inside = np.var(self.of_each[:, (self.place >= low) & (self.place < high)], axis=0)
+        count, inside = len(self.of_each), np.var(self._part(*part)[0], axis=0)
         begin, end = (int(2 * of * noise.size) for of in part)
         of_noise = (count - 1) * noise[begin:end].mean()
         seen = 1 - abs(self.turns[0].mean()) ** 2  # the mean holds the rest
