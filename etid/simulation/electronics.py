@@ -208,8 +208,8 @@ INSTRUMENTS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         # NI 6225, 16 bits, no filter: NI 6225 Specifications (M Series), AI Absolute Accuracy at
         # ±10 V: random noise 244 µV rms, INL 76 ppm of range; per °C 25 ppm of gain and 57 ppm of
-        # range of offset, here with 0.1 °C between two records. To be checked against the sheet:
-        # bandwidth 700 kHz, clock 50 ppm.
+        # range of offset, here with 0.1 °C between two records; timing accuracy 50 ppm (NI 6255
+        # Specifications, of the same series). To be checked against the sheet: bandwidth 700 kHz.
         "multifunction_card": {
             "electronics": Electronics(
                 filter_order=1, converter_noise=244e-6, nonlinearity=76e-6, gain_drift=2.5e-6
