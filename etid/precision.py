@@ -19,6 +19,7 @@ import numpy as np
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
+Tree = TypeVar("Tree")
 
 _NUMPY = (np.ndarray, np.generic, float, int, complex)
 
@@ -62,6 +63,14 @@ def is_traced(of: Any) -> bool:
     # `jnp.asarray` would compile a program of its own.
     leaves = [jax.device_put(0.0), *jax.tree.leaves(of)]
     return any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+
+
+def untraced(of: Tree) -> Tree:
+    """The same with arrays of NumPy, unless JAX traces one of its arrays."""
+    leaves, structure = jax.tree.flatten(of)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return of
+    return structure.unflatten(map(np.asarray, leaves))
 
 
 def is_float64() -> bool:

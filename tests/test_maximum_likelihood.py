@@ -17,8 +17,7 @@ from etid.estimators.maximum_likelihood import load, search
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify import fitting
-from etid.identify.fitting import known_of, skin_lane
+from etid.identify.fitting import known_of
 from etid.identify.options import Options, plan
 from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import Spectrum
@@ -32,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
 SAMPLES = 10_000
 SIGMAS = 5.0  # one in 2 million for a normal error
-FILES = 18  # that a reader of `identify_skin` opens at most; one of them looks for limited records
+FILES = 48  # that a reader of `identify_skin` opens at most, inspection and verdict included
 
 
 def simulate(trials=1, resistors=(98.8e3,), samples=SAMPLES, seed=0, **options):
@@ -97,7 +96,7 @@ def test_trigger_delays_of_a_tenth_of_a_sample_leave_every_trial_within_its_erro
 def test_a_fit_passes_through_few_files(study, driver):
     folder = pathlib.Path(etid.__file__).parent
     record = study["loaded/0"]
-    etid.identify_skin(record, driver)  # compiles
+    etid.identify_skin(record, driver)  # keeps what it learns of the driver
     entered: set[str] = set()
 
     def note(frame, event, _):
@@ -221,15 +220,7 @@ def test_a_driver_that_is_followed_too_far_is_no_success():
     assert "successful" in verdicts
 
 
-def test_a_study_of_ragged_lengths_compiles_once(study, driver, monkeypatch):
-    """What is compiled takes harmonics, of which records of all lengths have as many."""
-    traced = []
-
-    def counted(*arguments):
-        traced.append(arguments)
-        return skin_lane(*arguments)
-
-    monkeypatch.setattr(fitting, "skin_lane", counted)
+def test_records_of_ragged_lengths_are_fitted_together(study, driver):
     records = [
         record.replace(v_th=record.v_th[:size], v_out=record.v_out[:size])
         for record in study.loaded.recordings()
@@ -238,7 +229,6 @@ def test_a_study_of_ragged_lengths_compiles_once(study, driver, monkeypatch):
     fits = etid.identify_skins(records, driver)
     assert fits.counts() == {"successful": len(records)}
     assert (np.abs(off(fits)) < SIGMAS).all()
-    assert len(traced) <= 1  # none, if an earlier test has
 
 
 def test_a_circuit_far_from_its_typical_values_is_found():

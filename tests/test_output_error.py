@@ -199,10 +199,11 @@ def test_the_delay_of_the_calibration_is_known_as_well_as_its_standard_deviation
     _, fit_of = fitted
     known, *others = (
         np.diagonal(np.asarray((fit := fit_of(1.2, late)).cov - fit.shared_cov))
-        for late in (1e-6, 0.01, 0.02, 1e3)
+        for late in (1e-6, 0.005, 0.01, 1e3)
     )
     first, second, free = (cov - known for cov in others)
-    # Where a delay of the calibration matters most; the fits differ, too, by less than a tenth.
+    # Where a delay of the calibration matters most. The fits end at minima that differ, too: by a
+    # tenth of these small differences, and by more of those of less certain delays.
     element = np.argmax(free / known)
     ratio = (free[element] / first[element] - 1) / (free[element] / second[element] - 1)
     assert ratio == pytest.approx(4, rel=0.1)

@@ -118,7 +118,7 @@ class AbstractCircuit(_Titled, Overviewed, Module):
         return {f.name: f.metadata["unit"] for f in dataclasses.fields(cls)}
 
     @classmethod
-    def scaling(cls) -> Float[Array, "2 parameter"]:
+    def scaling(cls) -> Float[np.ndarray, "2 parameter"]:
         """Powers of impedance and of time scale to which each parameter is proportional."""
         powers = {
             "ohm": (1.0, 0.0),
@@ -129,7 +129,7 @@ class AbstractCircuit(_Titled, Overviewed, Module):
             "siemens second^alpha": (-1.0, 0.8),  # for a typical α; used only for starts of a fit
             "1": (0.0, 0.0),
         }
-        return jnp.array([powers[unit] for unit in cls.units().values()]).T
+        return np.array([powers[unit] for unit in cls.units().values()]).T
 
     @in_float64
     @np.errstate(all="ignore")  # elements of a fit that failed may be 0

@@ -26,12 +26,10 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, with_slopes
-from etid.estimators.lanes import LANES
 from etid.estimators.score_tests import FALSE_ALARMS
-from etid.numpy_tier.tiers import program
 from etid.recordings.repeats import ALIGNED, Repeats
 from etid.results.driver import Driver
 from etid.results.feed import AbstractFeed
@@ -65,17 +63,14 @@ def unknown(*shape: int) -> Change:
     return Change(nothing, nothing.copy(), np.zeros(lanes, bool))
 
 
-@program
+@np.errstate(all="ignore")  # elements of a fit that failed may be 0
 def log_slopes(
-    circuits: AbstractCircuit, driver: AbstractFeed, frequency: Float[Array, " band"]
-) -> Complex[Array, "lane element band"]:
+    circuits: AbstractCircuit, driver: AbstractFeed, frequency: Float[np.ndarray, " band"]
+) -> Complex[np.ndarray, "row element band"]:
     """∂ ln G/∂ ln q of the elements of circuits along a leading axis."""
-
-    def of(circuit: AbstractCircuit) -> Complex[Array, "element band"]:
-        load, by_element = with_slopes(circuit, circuit.log_values(), frequency)
-        return by_element * (driver.sensitivity(load, frequency) * reciprocal(load))[None, :]
-
-    return jax.vmap(of)(circuits)
+    logs = np.log(np.asarray(circuits.values()))
+    load, by_element = with_slopes(circuits, logs, frequency)
+    return by_element * (driver.sensitivity(load, frequency) * reciprocal(load))[:, None, :]
 
 
 @functools.lru_cache(maxsize=64)
@@ -260,24 +255,8 @@ def of_fits(fits: Fit, driver: AbstractFeed, repeats: Sequence[Repeats | None]) 
     usable = np.isfinite(values) & (values != 0) & (variance >= 0)
     allowed = np.sqrt(np.where(usable, variance, 0.0)) / np.where(usable, np.abs(values), 1.0)
     frequency = bands(repeats)
-    slopes = _slopes(fits.circuit, len(values), driver, frequency) if frequency.size else None
+    slopes = log_slopes(fits.circuit, driver, frequency) if frequency.size else None
     return found(repeats, slopes, allowed)
-
-
-def _slopes(
-    circuits: AbstractCircuit,
-    count: int,
-    driver: AbstractFeed,
-    frequency: Float[np.ndarray, " band"],
-) -> Complex[np.ndarray, "lane element band"]:
-    """`log_slopes` of circuits, one at a time or `LANES` at once: two compiled sizes suffice."""
-    size = 1 if count == 1 else LANES
-    parts = []
-    for first in range(0, count, size):
-        rows = np.minimum(np.arange(first, first + size), count - 1)  # padded with the last one
-        part = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], circuits)
-        parts.append(np.asarray(log_slopes(part, driver, jax.device_put(frequency))))
-    return np.concatenate(parts)[:count]
 
 
 def driver_judged(

@@ -54,6 +54,7 @@ HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, bu
 # Relative standard deviation of the resonance, above which loads are searched twice. At 60 dB and
 # 100 kHz it is 0.17 to 1.2 of 28 transformers that resonate at 95 kHz, of others 0.01 to 0.03.
 OPEN = 0.1
+ROWS = True  # whether NumPy fits harmonics as rows; if not, as a traced program
 _Outcome = TypeVar("_Outcome", Fit, Driver)
 
 
@@ -441,6 +442,11 @@ def remarks_on(seen: Inspected, estimator: AbstractEstimator) -> int:
     return int(seen.remarks | (Remark.current_unused if unused else 0))
 
 
+def whole(parts: Sequence[Fit]) -> Fit:
+    """Fits that are stacked in parts, in one."""
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
 class Batch:
     """Recordings that one call fits: they share a compiled function and a driver.
 
@@ -483,6 +489,9 @@ class Batch:
         def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
             def fitted_with(known: Any) -> Fit:
                 of = driver, known, circuit, estimator
+                rows = ROWS and jax.default_backend() == "cpu"
+                if rows and isinstance(estimator, MaximumLikelihood):
+                    return whole(estimator.fit_rows(lanes, *of[:-1]))
                 if not worth_compiling(total, lanes[0].periodic):
                     return stacked(jax.device_get([skin(lane, *of) for lane in lanes]))
                 fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))

@@ -167,7 +167,7 @@ class Impedances(NamedTuple):
 
 @program
 def _powers(circuit: AbstractCircuit) -> Float[Array, " element"]:
-    return circuit.scaling()[0]
+    return jnp.asarray(circuit.scaling()[0])
 
 
 def stretched(

@@ -142,7 +142,7 @@ def updated(
         amplitude: Relative amplitude of the pulse.
     """
     number = number + 1
-    powers = model.circuit.scaling()[0]  # also how a change of Z_th moves the elements
+    powers = jnp.asarray(model.circuit.scaling()[0])  # also how a change of Z_th moves the elements
     measured = measured_pulse(model.bands, seen, amplitude, before, noise)
     information = jax.vmap(lambda of: predicted(of, change))(before.information)
     logs = LoadUnknowns.of(before.own).log_elements

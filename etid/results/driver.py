@@ -26,7 +26,7 @@ from etid.results.feed import AbstractFeed, Load, SourceImpedance
 from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS, message
 from etid.signals.harmonics import Spectrum
-from etid.signals.transfer import Rational, delay_variable, reciprocal
+from etid.signals.transfer import AnyArray, Rational, delay_variable, reciprocal
 
 Order = int | Literal["auto"]
 AUTO: Literal["auto"] = "auto"
@@ -184,11 +184,10 @@ class Driver(AbstractFeed):
         z_load = jnp.asarray(load)
         return z_load * reciprocal(z_load + self.response(frequency))
 
-    @in_numpy
-    def sensitivity(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
+    def sensitivity(self, load: Load, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """∂ ln H / ∂ ln Z_L = Z_th / (Z_L + Z_th)."""
         z_th = self.response(frequency)
-        return z_th * reciprocal(jnp.asarray(load) + z_th)
+        return z_th * reciprocal(load + z_th)
 
     @abc.abstractmethod
     def response(self, frequency: Quantity) -> Complex[Array, "..."]:
@@ -329,8 +328,7 @@ class ContinuousDriver(Driver):
         """Standard deviation of the delay of the calibrations [samples at this rate, in Hz]."""
         return self.calibration.delay_std_samples * (sample_rate / self.sample_rate)
 
-    @in_numpy
-    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
+    def response(self, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """Source impedance Z_th [Ω] in continuous time at real frequencies [Hz]."""
         return self.source.response(frequency)
 

@@ -24,11 +24,10 @@ from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits.impedance import Quantity, realise
 from etid.circuits.overview import Overview
-from etid.numpy_tier.tiers import in_numpy
-from etid.precision import Module
+from etid.precision import Module, in_float64, namespace, untraced
 from etid.results.verdicts import RESULTS, Judged, verdict
 from etid.signals.filtering import StateSpace
-from etid.signals.transfer import Rational, as_complex
+from etid.signals.transfer import AnyArray, Rational, as_complex, from_parts
 
 Load = Complex[Array, "..."] | Complex[np.ndarray, "..."]
 """Type of the impedance of a load [Ω]."""
@@ -53,7 +52,7 @@ class AbstractFeed(Judged):
         """
 
     @abc.abstractmethod
-    def sensitivity(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
+    def sensitivity(self, load: Load, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """∂ ln H / ∂ ln Z_L.
 
         Args:
@@ -86,25 +85,28 @@ class SourceImpedance(Module):
         """Number of poles."""
         return 2 * self.log_omega.shape[0] + self.log_omega_real.shape[0]
 
-    @in_numpy
-    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
-        """Impedance [Ω] at real frequencies [Hz]."""
+    @in_float64
+    @np.errstate(all="ignore")  # parameters of a driver that failed may be any numbers
+    def response(self, frequency: Quantity) -> Complex[AnyArray, "..."]:
+        """Impedance [Ω] at real frequencies [Hz], an array of NumPy unless JAX traces it."""
+        of, frequency = untraced((self, frequency))
+        xp = namespace(of.gain, frequency)
         # In real arithmetic, which takes half the time to compile and to run.
-        omega = 2 * jnp.pi * jnp.asarray(frequency, float)[None]
+        omega = 2 * np.pi * xp.asarray(frequency, float)[None]
 
-        def each(values: Float[Array, " pole"]) -> Float[Array, "pole ..."]:
+        def each(values: Float[AnyArray, " pole"]) -> Float[AnyArray, "pole ..."]:
             return values.reshape(-1, *[1] * (omega.ndim - 1))
 
-        turn = omega * each(jnp.exp(-self.log_omega))
-        below, damped = 1 - turn * turn, 2 * each(jnp.exp(self.log_zeta)) * turn
+        turn = omega * each(xp.exp(-of.log_omega))
+        below, damped = 1 - turn * turn, 2 * each(xp.exp(of.log_zeta)) * turn
         scale = 1 / (below * below + damped * damped)
-        gain, slope = each(self.gain) * scale, each(self.slope) * turn * scale
-        turn_real = omega * each(jnp.exp(-self.log_omega_real))
-        gain_real = each(self.gain_real) / (1 + turn_real * turn_real)
+        gain, slope = each(of.gain) * scale, each(of.slope) * turn * scale
+        turn_real = omega * each(xp.exp(-of.log_omega_real))
+        gain_real = each(of.gain_real) / (1 + turn_real * turn_real)
         real = [gain * below + slope * damped, gain_real]
         imaginary = [slope * below - gain * damped, -gain_real * turn_real]
-        real, imaginary = (jnp.concatenate(of).sum(0) for of in (real, imaginary))
-        return jax.lax.complex(jnp.exp(self.log_resistance) + real, imaginary)
+        real, imaginary = (xp.concatenate(one).sum(0) for one in (real, imaginary))
+        return from_parts(xp.exp(of.log_resistance) + real, imaginary)
 
     @jax.jit  # JAX remembers its trace
     def with_slopes(
@@ -224,10 +226,10 @@ class MeasuredCurrent(AbstractFeed):
         del frequency
         return jnp.asarray(load)
 
-    def sensitivity(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
+    def sensitivity(self, load: Load, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """1: the voltage is proportional to the impedance."""
         del frequency
-        return jnp.ones_like(load)
+        return namespace(load).ones_like(load)
 
     @property
     def r_known(self) -> Float[Array, ""]:

@@ -35,7 +35,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.precision import Module, namespace
-from etid.signals.transfer import Values, power
+from etid.signals.transfer import AnyArray, Values, power
 
 WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate; above, aliases matter unless they fall between the harmonics
@@ -65,14 +65,14 @@ class Spectrum(Module):
 
 
 def same_unloaded(
-    one: Complex[Array, " harmonic"], other: Complex[Array, " _"]
-) -> Bool[Array, ""] | bool:
+    one: Complex[AnyArray, " harmonic"], other: Complex[AnyArray, " _"]
+) -> Bool[AnyArray, ""] | bool:
     """Whether the X of two recordings are transforms of the same unloaded record."""
     if one is other:
         return True
     if one.shape != other.shape:
         return False
-    return jnp.sum(power(one - other)) <= ROUNDING**2 * jnp.sum(power(other))
+    return power(one - other).sum() <= ROUNDING**2 * power(other).sum()
 
 
 def as_list(spectra: Spectrum) -> list[Spectrum]:
@@ -172,22 +172,31 @@ def _drift(
     return np.ascontiguousarray(at_harmonics.T), fit, powers
 
 
-def local_sum(values: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
+def local_sum(values: Float[Values, "*row harmonic"]) -> Float[Values, "*row harmonic"]:
     """Sum over the `WINDOW` harmonics around each harmonic.
 
     Not `jnp.convolve`: under `vmap` it becomes one convolution over all lanes, so that a NaN in
     one lane spoils the others. Its compiled code has also read beyond its input.
     """
-    size = min(WINDOW, values.shape[0])
-    return jax.lax.reduce_window(values, 0.0, jax.lax.add, (size,), (1,), "SAME")
+    count = values.shape[-1]
+    size = min(WINDOW, count)
+    if isinstance(values, np.ndarray):
+        before = (size - 1) // 2
+        sums = np.zeros((*values.shape[:-1], count + size))
+        np.cumsum(values, axis=-1, out=sums[..., before + 1 : before + 1 + count])
+        sums[..., before + 1 + count :] = sums[..., [before + count]]
+        return sums[..., size:] - sums[..., :-size]
+    ones = (1,) * (values.ndim - 1)
+    return jax.lax.reduce_window(values, 0.0, jax.lax.add, (*ones, size), (*ones, 1), "SAME")
 
 
 def signal_share(
-    coefficients: Complex[Array, " harmonic"], variance: Float[Array, " harmonic"]
-) -> Float[Array, " harmonic"]:
+    coefficients: Complex[Values, "*row harmonic"], variance: Float[Values, "*row harmonic"]
+) -> Float[Values, "*row harmonic"]:
     """Fraction of the power of noisy coefficients that is signal, locally averaged; 0 to 1."""
+    xp = namespace(coefficients)
     total, noise = local_sum(power(coefficients)), local_sum(variance)
-    return jnp.clip(1 - noise / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
+    return xp.clip(1 - noise / xp.where(total > 0, total, 1.0), 0.0, 1.0)
 
 
 def filled(

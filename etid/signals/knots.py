@@ -26,8 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Int
 
+from etid.precision import namespace
 from etid.signals.harmonics import ABSENT, Spectrum
-from etid.signals.transfer import as_complex, power
+from etid.signals.transfer import AnyArray, as_complex, power
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +43,7 @@ class _Group:
     def end(self) -> int:
         return self.first + self.width * self.count
 
-    @property
+    @functools.cached_property
     def shares(self) -> Float[np.ndarray, "width 2"]:
         """Shares of the left and of the right knot in each harmonic of an interval."""
         share = np.arange(self.width) / self.width
@@ -61,38 +62,50 @@ class Knots:
     groups: tuple[_Group, ...]
     index: Int[np.ndarray, " knot"]
 
-    def at(self, values: Inexact[Array, "*row harmonic"]) -> Inexact[Array, "*row knot"]:
+    def at(self, values: Inexact[AnyArray, "*row harmonic"]) -> Inexact[AnyArray, "*row knot"]:
         """Values at the knots."""
+        if isinstance(values, np.ndarray):
+            return values[..., self.index]
         return jnp.take(values, self.index, axis=-1, mode="clip")
 
-    def summed(self, values: Inexact[Array, "*row harmonic"]) -> Inexact[Array, "*row knot"]:
+    def summed(self, values: Inexact[AnyArray, "*row harmonic"]) -> Inexact[AnyArray, "*row knot"]:
         """Σ_k φ_b(k) v_k for each knot b."""
-        rows = values.shape[:-1]
-        pairs = [jnp.zeros((*rows, 0, 2), values.dtype)]  # a single harmonic has no interval
+        xp, rows = namespace(values), values.shape[:-1]
+        pairs = [xp.zeros((*rows, 0, 2), values.dtype)]  # a single harmonic has no interval
         for group in self.groups:
-            part = jax.lax.slice_in_dim(values, group.first, group.end, axis=-1)
+            part = values[..., group.first : group.end]
             part = part.reshape(*rows, group.count, group.width)
             pairs.append(_product(part, group.shares.astype(values.dtype)))
-        left, right = jnp.unstack(jnp.concatenate(pairs, axis=-2), axis=-1)
-        last, none = values[..., -1:], np.zeros((*rows, 1), values.dtype)
-        return jnp.concatenate([left, last], -1) + jnp.concatenate([none, right], -1)
+        pairs = xp.concatenate(pairs, axis=-2)
+        last, none = values[..., -1:], xp.zeros((*rows, 1), values.dtype)
+        left, right = pairs[..., 0], pairs[..., 1]
+        return xp.concatenate([left, last], -1) + xp.concatenate([none, right], -1)
 
-    def between(self, values: Inexact[Array, "*row knot"]) -> Inexact[Array, "*row harmonic"]:
+    def between(self, values: Inexact[AnyArray, "*row knot"]) -> Inexact[AnyArray, "*row harmonic"]:
         """Values at all harmonics, on straight lines between the knots."""
-        rows, parts, knot = values.shape[:-1], [], 0
-        pairs = jnp.stack([values[..., :-1], values[..., 1:]], axis=-1)
+        xp, rows, parts, knot = namespace(values), values.shape[:-1], [], 0
+        pairs = xp.stack([values[..., :-1], values[..., 1:]], axis=-1)
         for group in self.groups:
-            ends = jax.lax.slice_in_dim(pairs, knot, knot + group.count, axis=-2)
+            ends = pairs[..., knot : knot + group.count, :]
             line = _product(ends, group.shares.T.astype(values.dtype))
             parts.append(line.reshape(*rows, group.count * group.width))
             knot += group.count
-        return jnp.concatenate([*parts, values[..., -1:]], -1)
+        return xp.concatenate([*parts, values[..., -1:]], -1)
 
 
 def _product(
-    values: Inexact[Array, "*row interval n"], matrix: Inexact[np.ndarray, "n m"]
-) -> Inexact[Array, "*row interval m"]:
+    values: Inexact[AnyArray, "*row interval n"], matrix: Inexact[np.ndarray, "n m"]
+) -> Inexact[AnyArray, "*row interval m"]:
     """The product with a matrix; an operation of `lax` is traced in a fifth of the time."""
+    if isinstance(
+        values, np.ndarray
+    ):  # one product of two matrices takes a third of many small ones
+        flat = values.reshape(-1, values.shape[-1])
+        if np.iscomplexobj(values):
+            whole = np.real(flat) @ np.real(matrix) + 1j * (np.imag(flat) @ np.real(matrix))
+        else:
+            whole = flat @ matrix
+        return whole.reshape(*values.shape[:-1], -1)
     return jax.lax.dot_general(values, matrix, (((values.ndim - 1,), (0,)), ((), ())))
 
 

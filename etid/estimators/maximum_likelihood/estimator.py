@@ -1,6 +1,7 @@
 """Maximum likelihood on the harmonics; each load is fitted jointly with its driver."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -18,17 +19,18 @@ from etid.estimators.estimator import (
     Description,
 )
 from etid.estimators.judgement import STRAINED
-from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
+from etid.estimators.lanes import AbstractLane, Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood import given_driver, load_fit
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
+from etid.estimators.maximum_likelihood.rows import fit_rows
 from etid.estimators.refined_driver import from_harmonics
 from etid.estimators.score_tests.falling_resistance import NO_FALL
 from etid.estimators.score_tests.of_calibrations import MISSING_POLE
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.results.driver import Driver, HarmonicDriver
-from etid.results.feed import MeasuredCurrent
+from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
 
@@ -149,6 +151,19 @@ class MaximumLikelihood(AbstractEstimator):
         if known.shape is not None:
             found = found._replace(inconsistent=found.inconsistent | known.shape.differs(spectrum))
         return found.judged(circuit, driver.result, str(self), self.bounds, prior)
+
+    def fit_rows(
+        self,
+        lanes: Sequence[AbstractLane],
+        driver: AbstractFeed,
+        known: GivenDriver,
+        circuit: AbstractCircuit,
+    ) -> list[Fit]:
+        """Fits of several recordings, stacked in parts."""
+        prior = ElementPrior.of(self.known_elements, circuit)
+        harmonics = [lane for lane in lanes if isinstance(lane, Harmonics)]
+        of = known, circuit, str(self), prior, self.bounds
+        return fit_rows(harmonics, driver, *of)
 
     def describe(self) -> Description:
         """The text for a methods section."""

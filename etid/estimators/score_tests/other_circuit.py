@@ -37,7 +37,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import SEEN
-from etid.signals.transfer import as_complex, combined, frequency_variable
+from etid.signals.transfer import AnyArray, as_complex, combined, frequency_variable
 
 # Standard deviations. The fast relaxations have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for
 # six poles), so that 5 is in fact `SEEN`.
@@ -144,7 +144,7 @@ class Score(NamedTuple):
         stderr = jnp.where(tested, self.stderr, 0.0)
         return stderr, jnp.where(tested[..., None], self.slope, 0.0)
 
-    def would_show(self, powers: Float[Array, " element"]) -> Float[Array, ""]:
+    def would_show(self, powers: Float[AnyArray, " element"]) -> Float[Array, ""]:
         """Standard deviations of one change with ε = 1, if no element would be negative then.
 
         Z is linear in R and in 1/C, whose logarithms are those of the elements times `powers`.

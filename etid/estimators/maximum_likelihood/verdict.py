@@ -1,0 +1,211 @@
+"""The verdicts of estimates, which make them fits.
+
+If several verdicts apply, the most fundamental one is reported. The order is: the loop cannot be
+simulated, the elements are no circuit, the solver did not converge, the model does not explain the
+data, the data do not determine the parameters.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from etid.circuits.branches import exchangeable, in_order
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.element_limits import Limits, Within, limited, of_circuit, within
+from etid.estimators.lanes import stacked, taken
+from etid.likelihood.fit import Estimate
+from etid.likelihood.linear import diagonal
+from etid.numpy_tier.tiers import program
+from etid.recordings.remarks import Remark
+from etid.results.fit import Fit, Limited
+from etid.results.verdicts import RESULTS, verdict, verdicts_of
+
+GOOD = verdict("successful")
+
+MISFIT_CHI2 = 1.5  # the record gives the noise to about 5 %, so χ² is known to 10 %
+# Of the signal; the best converters and transformers leave this part unexplained.
+MISFIT_RRSE = 1e-3
+# Increase of the calibrations' sum of squares. Its distribution is chi-squared. The degrees of
+# freedom are at most the number of parameters of Z_th and the delays. With 12 degrees of freedom
+# the increase exceeds this value once in ten thousand.
+STRAINED = 39.0
+FIXED = 1e-9  # standard deviation of the logarithm of a fixed element, below all errors of a fit
+STEEP = 4.0  # standard errors by which an exponent exceeds 1: by chance once in 30 000
+STEP = 1e-5  # of the logarithm of an element, for the slope of an exponent
+
+
+def judged(
+    found: Estimate,
+    circuit: AbstractCircuit,
+    driver: RESULTS,
+    changed: Bool[np.ndarray, " row"],
+    method: str,
+    told: Float[np.ndarray, " element"],
+    width: Float[np.ndarray, " element"],
+    bounds: Limits = (),
+) -> Fit:
+    """The fits with their verdicts.
+
+    Args:
+        found: The estimates.
+        circuit: Structure of the load.
+        driver: Verdict of the driver.
+        changed: Whether unloaded voltages show that the driver has changed.
+        method: Name of the method.
+        told: Values of the elements that are known [SI].
+        width: Standard deviations of their logarithms; infinite for an element that is not known.
+        bounds: Bounds of elements; those of elements that the circuit lacks do not count.
+    """
+    own = of_circuit(bounds, circuit)
+    found = _ordered(found, circuit, told, width, own)
+    values, support = np.exp(found.logs), found.support
+    errors = np.sqrt(diagonal(found.cov))  # of the logarithms, so they are relative
+    outer = values[:, :, None] * values[:, None, :]
+    cov, shared_cov = found.cov * outer, found.shared_cov * outer
+    outside, contradicted = None, np.zeros(len(values), bool)
+    if own:
+        of = circuit.of_fit(np.moveaxis(values, -1, 0)), cov, shared_cov
+        numbers = map(np.asarray, _inside(*of, own))
+        inside, cov, shared_cov, outside, deviance, contradicted = numbers
+        support = dataclasses.replace(support, deviance=support.deviance + deviance)
+        errors = np.sqrt(diagonal(cov)) / inside
+        sound = np.isfinite(inside).all(-1, keepdims=True)
+        values = np.where(sound, inside, values)
+    values = np.where(width <= FIXED, told, values)
+    verdicts = (
+        (~np.isfinite(found.chi2), "unstable"),
+        (~np.isfinite(values).all(-1), "nonphysical"),
+        (_too_steep(circuit, found), "nonphysical"),
+        (~found.settled, "max_steps_reached"),
+        (_misses(found), "misfit"),
+        (found.falls, "misfit"),  # which can pass for a change of the driver
+        (found.strain > STRAINED, "inconsistent"),
+        (contradicted, "out_of_bounds"),
+        # An error of 0 also fails: the element has no effect. So does a value of 0, exp() of a far
+        # parameter: files of fits hold positive elements where a fit is successful.
+        (~((errors > 0) & (errors < 1) & (values > 0)).all(-1), "insensitive"),
+        (
+            np.full(len(values), np.asarray(driver._value) != np.asarray(GOOD._value)),
+            "driver_failed",
+        ),
+        (found.inconsistent | changed, "inconsistent"),
+        (found.far, "driver_unclear"),
+        (found.other, "misfit"),
+    )
+    conditions, names = zip(*verdicts, strict=True)
+    names = np.select(conditions, names, "successful")
+    remarks = (
+        (found.hum, Remark.mains_hum),
+        (found.falls, Remark.falls_with_current),
+        (found.doubtful, Remark.gain_doubtful),
+        (np.zeros(len(values), bool) if outside is None else (outside != 0).any(-1),
+         Remark.at_bound),
+    )  # fmt: skip
+    return Fit(
+        circuit=circuit.of_fit(np.moveaxis(values, -1, 0)),
+        cov=cov,
+        shared_cov=shared_cov,
+        rrse=found.rrse,
+        chi2=found.chi2,
+        result=verdicts_of(names),
+        steps=found.points,
+        method=method,
+        remarks=np.sum([np.where(on, int(one), 0) for on, one in remarks], axis=0),
+        support=support,
+        limits=_limits(circuit, own, outside, len(values)),
+        by_tolerance=found.effects,
+    )
+
+
+@program
+def _within(circuit: AbstractCircuit, cov: Any, shared_cov: Any, bounds: Limits) -> Within:
+    return within(circuit, cov, shared_cov, bounds)
+
+
+def _inside(circuit: AbstractCircuit, cov: Any, shared_cov: Any, bounds: Limits) -> Within:
+    """`within` of each row."""
+    rows = range(len(cov))
+    each = [_within(taken(circuit, row), cov[row], shared_cov[row], bounds) for row in rows]
+    return stacked(jax.device_get(each))
+
+
+def _limits(
+    circuit: AbstractCircuit,
+    bounds: Limits,
+    outside: Float[np.ndarray, "row element"] | None,
+    count: int,
+) -> Limited | None:
+    """The bounds of the elements of each fit; None without bounds."""
+    if outside is None:
+        return None
+    found = limited(circuit, bounds)
+    assert found is not None
+    lower, upper = (np.tile(end, (count, 1)) for end in (found.lower, found.upper))
+    return Limited(lower, upper, outside)
+
+
+def _misses(found: Estimate) -> Bool[np.ndarray, " row"]:
+    """Whether the residual exceeds the noise, both in standard deviations and in volts.
+
+    A part `MISFIT_RRSE` of the signal may remain unexplained, and noise explains a χ² of
+    `MISFIT_CHI2`. The model holds for a trigger delay of up to one sample.
+    """
+    excess = found.rrse * np.sqrt(np.maximum(1 - 1 / found.chi2, 0.0))
+    missed = (found.chi2 > MISFIT_CHI2) & (excess > MISFIT_RRSE)
+    return missed | (np.abs(found.delays) > 1).any(-1)
+
+
+def _too_steep(circuit: AbstractCircuit, found: Estimate) -> Bool[np.ndarray, " row"]:
+    """Whether an exponent α surely exceeds 1: no passive impedance falls faster.
+
+    If the true α is 1, noise makes the fitted α exceed 1 in every second fit.
+    """
+    if not circuit.exponents():
+        return np.zeros(len(found.logs), bool)
+
+    def alphas(logs: Float[np.ndarray, "row element"]) -> Float[np.ndarray, "row exponent"]:
+        of = circuit.of_fit(np.moveaxis(np.exp(logs), -1, 0))
+        return np.stack([np.broadcast_to(one, len(logs)) for one in of.exponents()], -1)
+
+    steps = STEP * np.eye(found.logs.shape[-1])
+    slopes = [(alphas(found.logs + one) - alphas(found.logs - one)) / (2 * STEP) for one in steps]
+    slope = np.stack(slopes, -1)
+    error = np.sqrt(((slope @ found.cov) * slope).sum(-1))
+    return (alphas(found.logs) - 1 > STEEP * error).any(-1)
+
+
+def _ordered(
+    found: Estimate,
+    circuit: AbstractCircuit,
+    told: Float[np.ndarray, " element"],
+    width: Float[np.ndarray, " element"],
+    bounds: Limits,
+) -> Estimate:
+    """The estimates, with branches that can be exchanged in their order."""
+    if not exchangeable(type(circuit)):
+        return found
+    limits = {name: ends for name, *ends in bounds}
+    ends = np.array([limits.get(name, (0.0, np.inf)) for name in circuit.names()]).T
+    places = np.stack([np.asarray(in_order(circuit, one, told, width, *ends))
+                       for one in found.logs])  # fmt: skip
+    rows = np.arange(len(places))[:, None]
+    both = rows[..., None], places[:, :, None], places[:, None, :]
+    support, effects = found.support, found.effects
+    by_error = np.take_along_axis(np.asarray(effects.moved), places[:, None, :], -1)
+    return found._replace(
+        logs=found.logs[rows, places],
+        cov=found.cov[both],
+        shared_cov=found.shared_cov[both],
+        support=type(support)(
+            support.deviance,
+            support.terms,
+            support.z,
+            support.spread_stderr,
+            support.spread_slope[rows, places],
+            support.layer_shows,
+        ),
+        effects=type(effects)(by_error, effects.stated),
+    )

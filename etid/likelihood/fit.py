@@ -1,0 +1,278 @@
+"""The fit of loads behind one driver: elements, standard errors, and what the data contradict."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from etid.likelihood import directions, scores
+from etid.likelihood.arrays import array_function
+from etid.likelihood.linear import diagonal, inverse
+from etid.likelihood.noise import excess, shows_hum
+from etid.likelihood.scores import Linear, Scores
+from etid.likelihood.search import Load, minimum
+from etid.likelihood.source import Errors
+from etid.precision import namespace
+from etid.results.fit import Support
+from etid.results.instrument import BUDGETED, Effects
+from etid.signals.harmonics import signal_share
+from etid.signals.transfer import AnyArray, as_complex, power
+
+FAULTS = (
+    3  # errors of the instrument that act on the record of a load: gain, crosstalk, capacitance
+)
+SEEN = 3.9  # standard deviations; a normal number exceeds it once in 10 000
+# The fast relaxations have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for six poles), so that
+# this is in fact `SEEN`.
+SEEN_RELAXATION = 5.0
+# α or ε must also deviate by this, which changes R_s by a few per cent. A driver whose order is too
+# low can imitate 0.002: four standard deviations at 60 dB with damp skin.
+SPREAD = 0.01
+MOVED = 0.02  # relative change of an element that is also necessary, for the same reason
+# Relative change of an element, from which on the scale of a current measured beside V_th is wrong.
+# A driver of too low order can imitate less.
+SCALE = 1e-3
+DOUBTED = 2.5  # standard deviations of a gain that goes into ±; one good recording in 80 has them
+GAIN = 0.02  # standard deviation of the gain between two channels that nobody compared
+NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
+SHARE = 0.5  # of the excess of χ², from which on a falling resistance is named as its cause
+UNSURE = 4.0  # standard deviations of χ² that are no excess
+# Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
+# 200 fits were wrong by five standard errors; both exceed it.
+FAR = 0.5
+UNSEEN = 1e-3  # of the variance of its prior, below which a recording tells nothing about an error
+
+
+class Estimate(NamedTuple):
+    """Fits without their verdicts.
+
+    Attributes:
+        logs: Logarithms of the elements.
+        delays: Trigger delay of each output [samples].
+        cov: Covariance of `logs`.
+        shared_cov: The part of it that comes from the driver.
+        chi2: Σ r² per degree of freedom.
+        rrse: Root relative squared error of the output that is predicted worst.
+        settled: Whether the search has found a minimum.
+        points: Number of points of the search.
+        strain: Increase of the Σ r² of the calibrations.
+        hum: Whether the residual shows mains hum.
+        falls: Whether a resistance that falls with its current explains most of the misfit.
+        doubtful: Whether another gain of V_out is likely; `cov` contains its effect.
+        far: Whether W is too far from W₀ for its linear distribution.
+        other: Whether the data show another circuit, another gain of V_out, or a resistance that
+            falls with its current.
+        inconsistent: Whether a delay, or the scale of an output such as a current, contradicts the
+            driver.
+        support: How well the data support the circuit.
+        effects: What errors of the instrument do to the elements.
+    """
+
+    logs: Float[AnyArray, "*row element"]
+    delays: Float[AnyArray, "*row output"]
+    cov: Float[AnyArray, "*row element element"]
+    shared_cov: Float[AnyArray, "*row element element"]
+    chi2: Float[AnyArray, "*row"]
+    rrse: Float[AnyArray, "*row"]
+    settled: Bool[AnyArray, "*row"]
+    points: Int[AnyArray, "*row"]
+    strain: Float[AnyArray, "*row"]
+    hum: Bool[AnyArray, "*row"]
+    falls: Bool[AnyArray, "*row"]
+    doubtful: Bool[AnyArray, "*row"]
+    far: Bool[AnyArray, "*row"]
+    other: Bool[AnyArray, "*row"]
+    inconsistent: Bool[AnyArray, "*row"]
+    support: Support
+    effects: Effects
+
+
+@array_function
+def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0) -> Estimate:
+    """The fits from their starts; for the arguments see `etid.likelihood.search.minimum`."""
+    xp, gains = namespace(starts), load.gains
+    source, e, owned, outputs = gains.source, gains.elements, gains.owned, gains.outputs.count
+    every, at_knots = load.knots, gains.at(load.knots.index)
+    least = minimum(load, starts, aside)
+    # Standard errors and tests are those of the last point; they do not change in a short step.
+    near, at = least.near, least.near.q
+    records = load.known(at)
+    profile, condensed = near.profile, near.condensed
+    share = signal_share(profile.x, records.variance_x)
+    noise = excess(profile.squares, records.used)
+    # All noise is that of a recording alone, or that of its outputs if V_th is shared.
+    private = noise if load.unloaded is None else noise * records.variance_y / profile.expected
+    values = xp.stack([xp.broadcast_to(share[..., None, :], noise.shape), noise, private], -3)
+    means = condensed.means(profile, every, values)
+    mean_noise, mean_private = means[..., 1, :], means[..., 2, :]
+    precision = 1 / load.width**2
+    spread = _block(precision[:owned], source.cov)
+    linear = Linear.of(
+        near.jacobian,
+        means[..., :2, :],
+        condensed.part,
+        precision * (at - load.centre),
+        spread,
+        precision,
+    )
+    changes = [directions.of_circuit(at_knots, near), directions.of_instrument(at_knots, near)]
+    changes = xp.concatenate(changes, -3)
+    tested, last = scores.smooth(linear, condensed.rows(changes), e), changes.shape[-3]
+    circuits, first = 2 + directions.RELAXATIONS, last - outputs
+    layer, spreads = tested.of_changes(0), tested.of_changes(1)
+    relaxations, scales = (
+        tested.of_changes(slice(2, circuits)),
+        tested.of_changes(slice(first, last)),
+    )
+    crosstalk, capacitance = tested.of_changes(circuits), tested.of_changes(circuits + 1)
+    gain = scales.of_changes(0)
+    added = directions.falling(near, every)
+    falling = scores.rough(linear, added, near, every, share, noise, e).of_changes(0)
+
+    squares, terms = 2 * profile.objective, records.terms
+    relevant = _relevant(spreads, relaxations, gain)
+    falls = (falling.z > SEEN) & (falling.moved > MOVED)
+    over = squares - terms - UNSURE * xp.sqrt(2 * terms)
+    causes = falls & (falling.z >= xp.abs(relevant).max(-1)) & (falling.explained > SHARE * over)
+
+    # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
+    made = (gain.others[..., None, None] * near.by_q(near.slopes)).sum(-3)
+    of_gain = changes[..., first, :, :] - made
+    explained = (as_complex(-gain.size)[..., None] * profile.x)[..., None, :]
+    explained = profile.whitened(explained * every.between(of_gain))
+    without = power(profile.innovations - explained) / profile.expected
+    hum = shows_hum(profile.squares, records.frequency, records.used)
+    wrong_gain = xp.abs(gain.z) > NO_HUM
+    wrong_gain = wrong_gain & ~shows_hum(without, records.frequency, records.used)
+
+    bread = linear.bread
+    elements = bread[..., :e, :]
+    by_term = elements @ linear.jacobian
+    own = (by_term * mean_private[..., None, :]) @ by_term.swapaxes(-1, -2)
+    of_own = elements[..., :owned]
+    own = own + (of_own * precision[:owned]) @ of_own.swapaxes(-1, -2)
+    of_driver = elements[..., owned:]
+    shared = of_driver @ source.cov @ of_driver.swapaxes(-1, -2)
+    if load.unloaded is not None:
+        of_unloaded = (mean_noise - mean_private)[..., None, :]
+        shared = shared + (by_term * of_unloaded) @ by_term.swapaxes(-1, -2)
+    proven = gain.exceeds(SEEN, MOVED)
+    doubtful = (xp.abs(gain.z) > DOUBTED) & ~proven
+    mean = gain.size / (1 + (gain.stderr / GAIN) ** 2)
+    shift = xp.where(doubtful, mean, 0.0)[..., None] * gain.slope
+    shift = xp.where(doubtful[..., None], shift, 0.0)
+    shared = shared + shift[..., :, None] * shift[..., None, :]
+    # For an element without any effect the matrix product contains only rounding errors.
+    variance = diagonal(elements[..., :e])
+    unknown = xp.where(variance > 1, variance, 0.0)[..., None] * np.eye(e)
+
+    logs, delays, z = gains.split(least.q)
+    change = gains.split(at)[2] - source.mean
+    strain = ((change @ inverse(source.cov)) * change).sum(-1) if change.shape[-1] else 0 * squares
+    w = at_knots.w(gains.split(at)[2])
+    moved = xp.where(records.used[..., 0, every.index], power(w), 0.0).max(-1)
+    beside = (load.rest(at)[..., :e] ** 2).sum(-1)
+    possible = xp.isfinite(spreads.z) & xp.isfinite(spreads.stderr)
+    support = Support(
+        squares + strain + beside - 2 * least.promised,
+        terms,
+        relevant,
+        xp.where(possible, spreads.stderr, 0.0),
+        xp.where(possible[..., None], spreads.slope, 0.0),
+        _would_show(layer, np.asarray(gains.circuit.scaling()[0])),
+    )
+    seen = (xp.abs(spreads.z) > SEEN) & (xp.abs(spreads.size) > SPREAD)
+    seen = seen | relaxations.exceeds(SEEN_RELAXATION, MOVED).any(-1)
+    contradicts = scales.of_changes(slice(1, None)).exceeds(SEEN, SCALE).any(-1)
+    width = load.width[e]  # of the prior of the delay of V_out
+    contradicts = contradicts | _beyond(delays[..., 0] / width, bread[..., e, e] / width**2)
+    if source.tolerances is not None and source.errors is not None:
+        by_z = source.errors.by_z[:, :FAULTS]  # the calibrations show those of their resistors
+        told = (by_z * (bread[..., owned:, owned:] @ by_z)).sum(-2)
+        errors = source.errors.at + z @ source.errors.by_z
+        contradicts = contradicts | _beyond(errors[..., :FAULTS], told).any(-1)
+    direct = xp.stack([of.others for of in (gain, crosstalk, capacitance)], -2)
+    return Estimate(
+        logs=logs,
+        delays=delays,
+        cov=own + shared + unknown,
+        shared_cov=shared,
+        chi2=squares / (terms - owned),
+        rrse=_rrse(load, profile.gains),
+        settled=least.settled,
+        points=least.points,
+        strain=strain,
+        hum=hum & ~wrong_gain,
+        falls=causes,
+        doubtful=doubtful,
+        far=xp.sqrt(moved) > FAR,
+        other=seen | proven | falls,
+        inconsistent=contradicts,
+        support=support,
+        effects=_effects(source.errors, bread, direct, e, owned),
+    )
+
+
+def _block(own: Float[AnyArray, " own"], of_source: Float[AnyArray, "z z"]) -> AnyArray:
+    """Block-diagonal matrix of the priors of the own parameters and of the source."""
+    xp, count, z = namespace(of_source), own.shape[0], of_source.shape[0]
+    upper = xp.concatenate([own[:, None] * np.eye(count), xp.zeros((count, z))], 1)
+    lower = xp.concatenate([xp.zeros((z, count)), of_source], 1)
+    return xp.concatenate([upper, lower], 0)
+
+
+def _relevant(spread: Scores, relaxations: Scores, gain: Scores) -> AnyArray:
+    """Z of all changes; 0 if a change is too small to matter."""
+    xp = namespace(gain.z)
+    first = xp.where(xp.abs(spread.size) > SPREAD, xp.nan_to_num(spread.z), 0.0)
+    others = [xp.where(of.moved > MOVED, xp.nan_to_num(of.z), 0.0) for of in (relaxations, gain)]
+    return xp.concatenate([first[..., None], others[0], others[1][..., None]], -1)
+
+
+def _would_show(layer: Scores, powers: np.ndarray) -> Float[AnyArray, "*row"]:
+    """Standard deviations of a layer, if no element would be negative then.
+
+    Z is linear in R and in 1/C, whose logarithms are those of the elements times `powers`. Infinite
+    if R or 1/C would be negative; 0 if the circuit can make the change itself.
+    """
+    xp = namespace(layer.z)
+    negative = (layer.slope * powers).min(-1) < -1
+    deviations = xp.where(negative, np.inf, 1 / layer.stderr)
+    return xp.where(xp.isfinite(layer.z), deviations, 0.0)
+
+
+def _beyond(z: Float[AnyArray, "*error"], variance: Float[AnyArray, "*error"]) -> AnyArray:
+    """Whether an error of the instrument, in its standard deviations, contradicts its tolerance."""
+    xp, left = namespace(z), 1 - variance  # the prior and the data differ by N(0, 1 − its variance)
+    return z**2 > SEEN**2 * xp.where(left > UNSEEN, left, np.inf)
+
+
+def _rrse(load: Load, gains: AnyArray) -> Float[AnyArray, "*row"]:
+    """RRSE of the output that is predicted worst."""
+    xp, records = namespace(gains), load.records
+    missed = xp.where(records.used, power(gains * records.x[..., None, :] - records.y), 0.0)
+    whole = xp.where(records.used, power(records.y), 0.0)
+    return xp.sqrt(missed.sum(-1) / whole.sum(-1)).max(-1)
+
+
+def _effects(
+    errors: Errors | None, bread: AnyArray, direct: AnyArray, e: int, owned: int
+) -> Effects:
+    """Changes of the logarithms of the elements by errors of the instrument.
+
+    A change of the prior mean of z by ζ moves them by H⁻¹ ζ. `direct` is what the parameters do of
+    gain, crosstalk and capacitance of the record alone.
+    """
+    if errors is None:
+        return Effects.unknown(e, *bread.shape[:-2])
+    xp, elements, direct = namespace(bread), bread[..., :e, owned:], direct[..., :e]
+    moved = (elements @ (errors.by_z + errors.unstated)).swapaxes(-1, -2)
+    of_record = xp.abs(moved[..., :FAULTS, :] - errors.direct[:, None] * direct)
+    each = moved[..., FAULTS:, :]
+    each = each.reshape(*each.shape[:-2], 2, -1, e)  # the resistors are independent
+    of_resistors = xp.sqrt((each**2).sum(-2))
+    drift = xp.sqrt(((elements @ errors.drift) ** 2).sum(-1))[..., None, :]
+    later = BUDGETED["later gain"] * xp.abs(direct[..., :1, :])
+    parts = of_record[..., :1, :], of_resistors, of_record[..., 1:, :], drift, later
+    stated = xp.broadcast_to(errors.stated, (*bread.shape[:-2], errors.stated.shape[-1]))
+    return Effects(xp.concatenate(parts, -2), stated)

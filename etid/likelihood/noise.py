@@ -1,0 +1,49 @@
+"""What the residual of a fit says of its noise: its variance by frequency, and mains hum.
+
+The weights of a fit are those of the noise that the record shows, but no model is exact. The
+covariance (Jᵀ C J in place of Jᵀ J, White 1980) therefore uses the variance of the residual.
+"""
+
+from jaxtyping import Bool, Float
+
+from etid.precision import namespace
+from etid.signals.harmonics import local_sum
+from etid.signals.mains import lines
+from etid.signals.transfer import AnyArray
+
+SURE = 4.0  # standard deviations by which a local variance must exceed the mean
+LOW = 128  # number of first harmonics that are tested for mains hum
+HUM = 14.4  # times the mean; an exponential exceeds it as rarely as a normal number exceeds five σ
+
+
+def excess(
+    squares: Float[AnyArray, "*row bin"], used: Bool[AnyArray, "*row bin"]
+) -> Float[AnyArray, "*row bin"]:
+    """Variance of a residual around each harmonic, relative to the expected variance; at least 1.
+
+    It is the mean over `harmonics.WINDOW` harmonics where this surely exceeds the mean over all
+    harmonics, and otherwise the mean over all. `squares` are relative to their expectation.
+    """
+    xp = namespace(squares)
+    total, of = xp.where(used, 2 * squares, 0.0), xp.where(used, 2.0, 0.0)
+    overall = total.sum(-1) / xp.maximum(of.sum(-1), 1.0)
+    overall = xp.maximum(overall, 1.0)[..., None]
+    freedom = xp.maximum(local_sum(of), 1.0)
+    local = local_sum(total) / freedom
+    sure = local > overall * (1 + SURE * xp.sqrt(2 / freedom))
+    return xp.where(sure, local, overall)
+
+
+def shows_hum(
+    squares: Float[AnyArray, "*row output bin"],
+    frequency: Float[AnyArray, "*row bin"],
+    used: Bool[AnyArray, "*row output bin"],
+) -> Bool[AnyArray, "*row"]:
+    """Whether the squares of an output show mains hum; without hum their mean is 1."""
+    xp = namespace(squares)
+    squares, used = squares[..., :LOW], used[..., :LOW]
+    suspect = lines(frequency[..., :LOW])[..., None, :]
+    others = used & ~suspect
+    around = xp.where(others, squares, 0.0).sum(-1) / xp.maximum(others.sum(-1), 1)
+    loudest = xp.where(suspect, squares, 0.0).max(-1)
+    return (loudest > HUM * xp.maximum(around, 1.0)).any(-1)

@@ -1,0 +1,168 @@
+"""Score tests of a fitted load: what the data show of changes that its parameters cannot make.
+
+Let r be the residual of a fit in standard deviations and d its derivative with respect to the size
+ε of a change, with the effect of the parameters projected out. If there is no such change, z = d·r
+/ σ(d·r) is normal (Rao's score test). The parameters need not be at a minimum: the part of the
+residual that they could still explain is projected out, too (Neyman's C(α)).
+
+The covariance is a "sandwich" (White 1980, Econometrica 48),
+
+    cov = H⁻¹ (J C Jᵀ + P) H⁻¹,      H = J W Jᵀ + P,
+
+with the derivatives J of the terms, the variance C of each term, the share W of signal in each
+term, and the curvature P of the priors, which is also the covariance of their gradient.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from etid.likelihood.linear import inverse
+from etid.likelihood.search import Near
+from etid.precision import namespace
+from etid.signals.knots import Knots
+from etid.signals.transfer import AnyArray, as_complex, power
+
+NOTHING = 1e-9  # of the power of a change; rounding leaves less of one that the circuit can make
+
+
+class Linear(NamedTuple):
+    """The terms of a fit near its minimum, linear in the parameters.
+
+    Attributes:
+        jacobian: J, transposed.
+        share: Diagonal of W.
+        noise: Diagonal of C.
+        residual: The terms.
+        pull: Gradient of the priors.
+        spread: Covariance of this gradient, P in the score.
+        bread: H⁻¹.
+    """
+
+    jacobian: Float[AnyArray, "*row q part"]
+    share: Float[AnyArray, "*row part"]
+    noise: Float[AnyArray, "*row part"]
+    residual: Float[AnyArray, "*row part"]
+    pull: Float[AnyArray, "*row q"]
+    spread: Float[AnyArray, "q q"]
+    bread: Float[AnyArray, "*row q q"]
+
+    @classmethod
+    def of(
+        cls,
+        jacobian: Float[AnyArray, "*row q part"],
+        means: Float[AnyArray, "*row 2 part"],
+        residual: Float[AnyArray, "*row part"],
+        pull: Float[AnyArray, "*row q"],
+        spread: Float[AnyArray, "q q"],
+        precision: Float[AnyArray, " q"],
+    ) -> "Linear":
+        """The terms; `means` are W and C, `precision` is what the priors tell of each parameter."""
+        share, noise = means[..., 0, :], means[..., 1, :]
+        weighted = jacobian * share[..., None, :]
+        expected = weighted @ jacobian.swapaxes(-1, -2)
+        expected = expected + precision * np.eye(precision.shape[-1])
+        return cls(jacobian, share, noise, residual, pull, spread, inverse(expected))
+
+
+class Scores(NamedTuple):
+    """Scores of changes.
+
+    Attributes:
+        z: Standard deviations; NaN if the parameters can make the change.
+        size: Estimate of ε.
+        moved: Largest change of the logarithm of an element by this ε.
+        stderr: Standard error of ε.
+        slope: Change of the logarithm of each element for each unit of ε.
+        others: What the parameters do of the change.
+        explained: Part of Σ r² that the change explains.
+    """
+
+    z: Float[AnyArray, "*row change"]
+    size: Float[AnyArray, "*row change"]
+    moved: Float[AnyArray, "*row change"]
+    stderr: Float[AnyArray, "*row change"]
+    slope: Float[AnyArray, "*row change element"]
+    others: Float[AnyArray, "*row change q"]
+    explained: Float[AnyArray, "*row change"]
+
+    @classmethod
+    def of(
+        cls,
+        score: Float[AnyArray, "*row change"],
+        variance: Float[AnyArray, "*row change"],
+        curvature: Float[AnyArray, "*row change"],
+        whole: Float[AnyArray, "*row change"],
+        others: Float[AnyArray, "*row change q"],
+        elements: int,
+    ) -> "Scores":
+        """Scores from the score of each change, its variance, and its curvature.
+
+        `whole` is the curvature before the parameters are projected out.
+        """
+        xp = namespace(score)
+        size, deviation = score / curvature, xp.sqrt(variance)
+        slope = -others[..., :elements]
+        moved = xp.abs(size) * xp.abs(slope).max(-1)
+        z = xp.where(curvature <= NOTHING * whole, np.nan, score / deviation)
+        return cls(z, size, moved, deviation / curvature, slope, others, score**2 / curvature)
+
+    def of_changes(self, which: int | slice) -> "Scores":
+        """Those of one or several changes."""
+        axis = [2 if name in ("slope", "others") else 1 for name in self._fields]
+        keep = [(..., which) if n == 1 else (..., which, slice(None)) for n in axis]
+        return Scores(*(of[place] for of, place in zip(self, keep, strict=True)))
+
+    def exceeds(self, limit: float, moved: float) -> Bool[AnyArray, "*row change"]:
+        """Whether z exceeds this limit and the change moves an element by so much."""
+        return (namespace(self.z).abs(self.z) > limit) & (self.moved > moved)
+
+
+def smooth(linear: Linear, rows: Float[AnyArray, "*row change part"], elements: int) -> Scores:
+    """Scores of changes of the gains at the knots: `rows` are those of the terms."""
+    by_share = (rows * linear.share[..., None, :]) @ linear.jacobian.swapaxes(-1, -2)
+    others = by_share @ linear.bread
+    left = rows - others @ linear.jacobian
+    score = (left @ linear.residual[..., None])[..., 0]
+    score = score - (others * linear.pull[..., None, :]).sum(-1)
+    of_priors = ((others @ linear.spread) * others).sum(-1)
+    sums = left**2 @ namespace(rows).stack([linear.noise, linear.share], -1)
+    whole = (rows**2 @ linear.share[..., None])[..., 0]
+    return Scores.of(
+        score, sums[..., 0] + of_priors, sums[..., 1] + of_priors, whole, others, elements
+    )
+
+
+def rough(
+    linear: Linear,
+    added: Complex[AnyArray, "*row output bin"],
+    near: Near,
+    knots: Knots,
+    share: Float[AnyArray, "*row bin"],
+    noise: Float[AnyArray, "*row output bin"],
+    elements: int,
+) -> Scores:
+    """Score of one change of the outputs at all harmonics, which is not smooth in frequency.
+
+    `share` is that of the signal in the power of X, `noise` the variances of the innovations
+    relative to those expected.
+    """
+    xp, profile = namespace(added), near.profile
+    weighted = profile.weighted(profile.whitened(added))
+    parts = xp.conj(weighted) * (profile.x * as_complex(share))[..., None, :]
+    sums = knots.summed(xp.stack([parts.real, parts.imag], -3))
+    by_q = near.by_q(near.slopes)
+    told = by_q.real * sums[..., :1, :, :] - by_q.imag * sums[..., 1:, :, :]
+    others = (told.sum((-2, -1))[..., None, :] @ linear.bread)[..., 0, :]
+    made = (others[..., None, None] * by_q).sum(-3)
+    direction = added - profile.x[..., None, :] * knots.between(made)
+    total = (xp.conj(direction) * profile.pull).real.sum((-2, -1))
+    total = total + (others * linear.pull).sum(-1)
+    of_priors = ((others @ linear.spread) * others).sum(-1)
+    squares = profile.weight * power(profile.whitened(direction))
+    variance = (squares * noise).sum((-2, -1)) + of_priors
+    curvature = (squares * share[..., None, :]).sum((-2, -1)) + of_priors
+    score, variance, curvature = (one[..., None] for one in (total, variance, curvature))
+    none = xp.zeros_like(curvature)
+    return Scores.of(score, variance, curvature, none, others[..., None, :], elements)

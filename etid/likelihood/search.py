@@ -1,0 +1,383 @@
+"""The minimum of the likelihood of a load, by successive approximations.
+
+The likelihood of all harmonics is expensive. Condensed to the knots near one point
+(`etid.likelihood.profile`) it is not: the minimum of the condensed terms is the next point, where
+it is condensed again. A point that is worse than the best before it is replaced by the middle
+between both. Mostly two or three points are enough.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from etid.likelihood.arrays import array_function
+from etid.likelihood.gains import Gains, Slopes
+from etid.likelihood.linear import NormalEquations, chosen, levenberg_marquardt
+from etid.likelihood.profile import Condensed, Profile, Records
+from etid.likelihood.shared import Unloaded
+from etid.precision import namespace
+from etid.signals.knots import Knots, knots
+from etid.signals.transfer import AnyArray, as_complex, reciprocal
+
+_Arrays = TypeVar("_Arrays")
+
+POINTS = 100  # largest number of points; below 24 dB some fits take dozens
+BEFORE = 0.05  # [standard errors] largest distance to the minimum before the last step
+# [standard errors] An approximation errs by a tenth: if a point so near is no better, the best
+# point is the minimum.
+NO_BETTER = 0.3
+IDLE = 3  # points in a row with a reduction below the rounding errors of ½ Σ r²
+ROUNDING = 1e-6  # of ½ Σ r²
+NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
+STEPS = 50  # largest number of steps at the knots of one point
+FARTHEST = 3.0  # scale of a step in the logarithm of an element, and in a delay [samples]
+DISTANT = 0.1  # part of ½ Σ r² that a step promises, above which a point is distant
+ROUGHLY = 1e-3  # of ½ Σ r², which a step of a rough fit of a distant point reduces
+WELL = 0.1  # of the distance `BEFORE`, to which the condensed terms are minimised
+
+
+@dataclasses.dataclass(frozen=True)
+class Load:
+    """Recordings behind one driver, with all that their likelihood needs.
+
+    Attributes:
+        gains: The gains at all harmonics.
+        records: The recordings.
+        centre: Prior means of the parameters.
+        width: Prior standard deviations of the parameters; infinite without a prior.
+        unloaded: X that the calibrations estimate; None if the recordings share none with them.
+    """
+
+    gains: Gains
+    records: Records
+    centre: Float[AnyArray, " q"]
+    width: Float[AnyArray, " q"]
+    unloaded: Unloaded | None = None
+
+    @property
+    def knots(self) -> Knots:
+        """Knots of the harmonics."""
+        return knots(self.records.x.shape[-1])
+
+    def of(self, rows: np.ndarray) -> "Load":
+        """Some of the rows."""
+        unloaded = self.unloaded and self.unloaded.of(rows)
+        of = self.gains.of(rows), self.records.of(rows)
+        return Load(*of, self.centre, self.width, unloaded)
+
+    def known(self, q: Float[AnyArray, "*row q"]) -> Records:
+        """The records with the X that the calibrations estimate."""
+        if self.unloaded is None:
+            return self.records
+        x, variance = self.unloaded.at(self.gains.split(q)[2])
+        return self.records._replace(x=x, variance_x=variance)
+
+    def rest(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row q"]:
+        """Terms of the priors."""
+        return (q - self.centre) / self.width
+
+    def objective(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row"]:
+        """½ Σ r² of all terms."""
+        profile = Profile.of(self.known(q), self.gains(q))
+        return profile.objective + 0.5 * (self.rest(q) ** 2).sum(-1)
+
+
+class Near(NamedTuple):
+    """A likelihood near a point.
+
+    Attributes:
+        q: The point.
+        objective: ½ Σ r² of all terms.
+        profile: The likelihood at all harmonics.
+        condensed: The same at the knots.
+        slopes: The gains and their derivatives at the knots.
+        by_x: Relative derivatives of X with respect to z at the knots; None if X does not depend
+            on z.
+    """
+
+    q: Float[AnyArray, "*row q"]
+    objective: Float[AnyArray, "*row"]
+    profile: Profile
+    condensed: Condensed
+    slopes: Slopes
+    by_x: Complex[AnyArray, "*row z knot"] | None
+
+    @classmethod
+    def of(cls, load: Load, at_knots: Gains, q: Float[AnyArray, "*row q"]) -> "Near":
+        """The likelihood near q."""
+        profile, every = Profile.of(load.known(q), load.gains(q)), load.knots
+        objective = profile.objective + 0.5 * (load.rest(q) ** 2).sum(-1)
+        by_x = None
+        if load.unloaded is not None:
+            xp, size = namespace(q), profile.size[..., :1, :]
+            moved = load.unloaded.x_by_z * reciprocal(profile.x)[..., None, :]
+            sums = every.summed(xp.concatenate([size, size * moved.real, size * moved.imag], -2))
+            total, (real, imag) = sums[..., :1, :], xp.split(sums[..., 1:, :], 2, -2)
+            by_x = (real + 1j * imag) / as_complex(xp.where(total > 0, total, 1.0))
+        slopes = at_knots.slopes(q)
+        return cls(q, objective, profile, Condensed.of(profile, every), slopes, by_x)
+
+    def by_q(self, slopes: Slopes) -> Complex[AnyArray, "*row q output knot"]:
+        """Derivatives of G X/X̂ with respect to the parameters."""
+        if self.by_x is None:
+            return slopes.by_q
+        moved = self.by_x[..., None, :] * slopes.gains[..., None, :, :]
+        own = slopes.by_q.shape[-3] - moved.shape[-3]
+        parts = slopes.by_q[..., :own, :, :], slopes.by_q[..., own:, :, :] + moved
+        return namespace(moved).concatenate(parts, -3)
+
+    def moved(self, slopes: Slopes, z: Float[AnyArray, "*row z"]) -> AnyArray:
+        """The gains times X/X̂, at z that are so much larger than those of the point."""
+        if self.by_x is None:
+            return slopes.gains
+        change = (as_complex(z)[..., None] * self.by_x).sum(-2)
+        return slopes.gains * (1 + change[..., None, :])
+
+    @property
+    def jacobian(self) -> Float[AnyArray, "*row q part"]:
+        """Transposed Jacobian of the condensed terms."""
+        return self.condensed.rows(self.by_q(self.slopes))
+
+
+def _equations(
+    load: Load, near: Near, slopes: Slopes, q: Float[AnyArray, "*row q"]
+) -> NormalEquations:
+    """Normal equations of condensed terms, of the priors, and of the distance from the point.
+
+    The distance keeps a step where the approximation holds (the proximal point algorithm of
+    Rockafellar 1976). At the minimum it has no effect.
+    """
+    xp, at, split = namespace(q), near.q, load.gains.split
+    rows = near.condensed.rows(near.by_q(slopes))
+    terms = near.condensed.terms(near.moved(slopes, split(q)[2] - split(at)[2]))
+    prior, owned = 1 / load.width, load.gains.owned
+    close = np.where(np.arange(q.shape[-1]) < owned, 1 / FARTHEST, 0.0)
+    rest, off = load.rest(q), close * (q - at)
+    every = (terms**2).sum(-1) + (rest**2).sum(-1) + (off**2).sum(-1)
+    gradient = (rows @ terms[..., None])[..., 0] + prior * rest + close * off
+    matrix = rows @ rows.swapaxes(-1, -2) + (prior**2 + close**2) * np.eye(q.shape[-1])
+    finite = xp.isfinite(every) & xp.isfinite(gradient).all(-1)
+    return NormalEquations(xp.where(finite, 0.5 * every, np.inf), gradient, matrix)
+
+
+class Minimum(NamedTuple):
+    """The minimum and what is known of the best point, next to it.
+
+    Attributes:
+        q: The minimum, one step from the best point.
+        near: The likelihood near the best point.
+        promised: Reduction of ½ Σ r² by this step; 0 if the search failed.
+        settled: Whether this is the minimum.
+        points: Number of points.
+    """
+
+    q: Float[AnyArray, "*row q"]
+    near: Near
+    promised: Float[AnyArray, "*row"]
+    settled: Bool[AnyArray, "*row"]
+    points: Int[AnyArray, "*row"]
+
+
+class _State(NamedTuple):
+    trial: Float[AnyArray, "*row q"]
+    near: Near
+    target: Float[AnyArray, "*row q"]
+    promised: Float[AnyArray, "*row"]
+    settled: Bool[AnyArray, "*row"]
+    idle: Int[AnyArray, "*row"]
+    points: Int[AnyArray, "*row"]
+
+
+@array_function
+def minimum(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0) -> Minimum:
+    """The minimum, without a derivative.
+
+    Args:
+        load: The recordings.
+        starts: Starts, the likeliest first.
+        aside: Distance of the first delay from that of the start [samples].
+    """
+    at_knots = load.gains.at(load.knots.index)
+    near = _likeliest(load, at_knots, starts)
+    if load.gains.outputs.count > 1:
+        # These starts have no delays, and an approximation so far from the minimum may lead away.
+        near = _approached(load, at_knots, near)
+    if aside != 0:
+        shift = np.zeros(starts.shape[-1])
+        shift[load.gains.elements : load.gains.owned] = aside
+        near = Near.of(load, at_knots, near.q + shift)
+    xp, none = namespace(starts), np.zeros(starts.shape[1:-1], int)
+    better = xp.isfinite(near.objective)
+    state = _next(load, at_knots, near, better, xp.zeros_like(near.objective), none)
+
+    def step(load: Load, at_knots: Gains, state: _State) -> _State:
+        near = Near.of(load, at_knots, state.trial)
+        reduced = state.near.objective - near.objective
+        better = reduced >= 0
+        kept = select(better, near, state.near)
+        found = _next(load, at_knots, kept, better, reduced, state.idle)
+        return found._replace(points=state.points + 1)
+
+    def goes_on(state: _State) -> Bool[AnyArray, "*row"]:
+        return ~state.settled & xp.isfinite(state.near.objective) & (state.points < POINTS)
+
+    if xp is np:
+        while (live := np.flatnonzero(goes_on(state))).size:
+            if live.size == len(none):
+                state = step(load, at_knots, state)
+            else:
+                part = step(load.of(live), at_knots.of(live), taken(state, live))
+                state = replaced(state, live, part)
+    else:
+        state = jax.lax.while_loop(
+            lambda state: goes_on(state).any(),
+            lambda state: select(goes_on(state), step(load, at_knots, state), state),
+            state,
+        )
+    q = xp.where(state.settled[..., None], state.target, state.near.q)
+    promised = xp.where(state.settled, state.promised, 0.0)
+    return Minimum(q, state.near, promised, state.settled, state.points)
+
+
+def _likeliest(load: Load, at_knots: Gains, starts: Float[AnyArray, "start *row q"]) -> Near:
+    """The likelihood near the first start, or near the best of all where its χ² is large."""
+    xp, first = namespace(starts), Near.of(load, at_knots, starts[0])
+    far = ~(2 * first.objective < NEAR * load.records.terms)
+
+    def best(load: Load, starts: Float[AnyArray, "start *row q"]) -> Float[AnyArray, "*row q"]:
+        objectives = load.objective(starts)
+        objectives = xp.where(xp.isfinite(objectives), objectives, np.inf)
+        place = xp.argmin(objectives, axis=0)[None, ..., None]
+        return xp.take_along_axis(starts, place, 0)[0]
+
+    if xp is not np:  # no branch: all starts are tried
+        return Near.of(load, at_knots, xp.where(far[..., None], best(load, starts), starts[0]))
+    if len(starts) == 1 or not far.any():
+        return first
+    rows, of = np.flatnonzero(far), load.of(np.flatnonzero(far))
+    near = Near.of(of, at_knots.of(rows), best(of, starts[:, rows]))
+    return replaced(first, rows, near) if rows.size < far.size else near
+
+
+def _approached(load: Load, at_knots: Gains, near: Near) -> Near:
+    """The likelihood near a point from which an approximation leads on, if `near` is far away.
+
+    The likelihood is condensed anew at each step of Levenberg-Marquardt.
+    """
+
+    def of(near: Near) -> NormalEquations:
+        found = _equations(load, near, near.slopes, near.q)
+        finite = namespace(near.q).isfinite(found.objective)
+        return found._replace(objective=namespace(near.q).where(finite, near.objective, np.inf))
+
+    def equations(q: Float[AnyArray, "*row q"]) -> NormalEquations:
+        return of(Near.of(load, at_knots, q))
+
+    enough = ROUGHLY * near.objective
+    found = levenberg_marquardt(equations, near.q, of(near), 1e-2, enough, STEPS)
+    return Near.of(load, at_knots, found.q)
+
+
+def _next(
+    load: Load,
+    at_knots: Gains,
+    near: Near,
+    better: Bool[AnyArray, "*row"],
+    reduced: Float[AnyArray, "*row"],
+    idle: Int[AnyArray, "*row"],
+) -> _State:
+    """Where the search goes from the best point; `better` says whether the last one is the best."""
+    xp, best, scale = namespace(near.q), near.q, near.objective / load.records.terms
+    here = _equations(load, near, near.slopes, best)
+    newton = here.step()
+    promised = here.promised(newton)
+    close = promised <= BEFORE**2 * scale
+    target = xp.where(close[..., None], best + newton, best)
+    goes = ~close & xp.isfinite(promised)
+    if xp is not np or goes.any():
+        target, left = _followed(load, at_knots, near, here, target, goes, promised)
+        promised = xp.where(goes, here.objective - left, promised)
+    stays = ~better & (promised <= NO_BETTER**2 * scale)
+    target = xp.where(stays[..., None], best, target)
+    promised = xp.where(stays, 0.0, promised)
+    idles = xp.maximum(xp.abs(reduced), promised) <= ROUNDING * near.objective
+    idle = xp.where(idles, idle + 1, 0)
+    trial = xp.where(better[..., None], target, 0.5 * (target + best))
+    trial = xp.where(xp.isfinite(trial).all(-1)[..., None], trial, best)
+    settled = (promised <= BEFORE**2 * scale) | (idle >= IDLE)
+    return _State(trial, near, target, promised, settled, idle, xp.ones_like(idle))
+
+
+def _followed(
+    load: Load,
+    at_knots: Gains,
+    near: Near,
+    here: NormalEquations,
+    target: Float[AnyArray, "*row q"],
+    goes: Bool[AnyArray, "*row"],
+    promised: Float[AnyArray, "*row"],
+) -> tuple[Float[AnyArray, "*row q"], Float[AnyArray, "*row"]]:
+    """The minimum of the condensed terms in the rows that go on, and the objective there.
+
+    From a distant point, a joint fit would distort Z_th: the own parameters go first.
+    """
+    xp = namespace(target)
+    if xp is np and not goes.all():
+        rows, found = np.flatnonzero(goes), target.copy()
+        left = np.zeros(target.shape[:-1])
+        of = taken(near, rows), taken(here, rows), target[rows], goes[rows], promised[rows]
+        found[rows], left[rows] = _followed(load.of(rows), at_knots.of(rows), *of)
+        return found, left
+    at, scale = near.q, near.objective / load.records.terms
+    own = np.arange(at.shape[-1]) < load.gains.owned
+
+    def equations(free: np.ndarray) -> Callable[[AnyArray], NormalEquations]:
+        def of(q: Float[AnyArray, "*row q"]) -> NormalEquations:
+            found = _equations(load, near, at_knots.slopes(q), q)
+            if free.all():
+                return found
+            matrix = found.matrix * (free[:, None] & free) + np.diag(1.0 * ~free)
+            return found._replace(gradient=found.gradient * free, matrix=matrix)
+
+        return of
+
+    q = xp.where(goes[..., None], at, target)
+    distant = goes & (promised >= DISTANT * near.objective)
+    every = equations(np.ones_like(own))
+    if xp is not np or distant.any():
+        enough, alone = xp.where(distant, ROUGHLY * near.objective, np.inf), equations(own)
+        q = levenberg_marquardt(alone, q, alone(q), 1e-2, enough, STEPS).q
+        here = every(q)
+    enough = xp.where(goes, (WELL * BEFORE) ** 2 * scale, np.inf)
+    last = levenberg_marquardt(every, q, here, 1e-9, enough, STEPS)
+    # A fit that did not settle promises everything: it is at no minimum.
+    left = xp.where(last.moves, -np.inf, last.equations.objective)
+    return xp.where(goes[..., None], last.q, target), left
+
+
+def taken(of: _Arrays, rows: np.ndarray) -> _Arrays:
+    """Some rows of all arrays."""
+    return jax.tree.map(lambda leaf: leaf[rows], of)
+
+
+def replaced(of: _Arrays, rows: np.ndarray, by: _Arrays) -> _Arrays:
+    """All arrays, some rows of which are replaced; the arrays are changed in place."""
+    leaves, others = jax.tree.leaves(of), jax.tree.leaves(by)
+    for leaf, other in zip(leaves, others, strict=True):
+        leaf[rows] = other
+    return of
+
+
+def select(rows: Bool[AnyArray, "*row"], new: _Arrays, old: _Arrays) -> _Arrays:
+    """All arrays, from `new` in these rows and from `old` in the others."""
+    if isinstance(rows, np.ndarray):
+        if rows.all():
+            return new
+        if not rows.any():
+            return old
+    leaves, structure = jax.tree.flatten(new)
+    return structure.unflatten(chosen(rows, leaves, jax.tree.leaves(old)))
