@@ -64,12 +64,14 @@ class State(NamedTuple):
         q: The best point.
         equations: The normal equations there.
         damping: Damping of the next step, relative to the diagonal.
-        moves: Whether the search goes on.
+        move: The next step.
+        moves: Whether it is taken.
     """
 
     q: Float[AnyArray, "*row q"]
     equations: NormalEquations
     damping: Float[AnyArray, "*row"]
+    move: Float[AnyArray, "*row q"]
     moves: Bool[AnyArray, "*row"]
 
 
@@ -92,22 +94,27 @@ def levenberg_marquardt(
         steps: Largest number of steps.
     """
     xp = namespace(start)
-    state = State(
-        start, first, xp.full_like(first.objective, damping), xp.isfinite(first.objective)
-    )
+
+    def proposed(
+        q: Float[AnyArray, "*row q"],
+        equations: NormalEquations,
+        damping: Float[AnyArray, "*row"],
+        moves: Bool[AnyArray, "*row"],
+    ) -> State:
+        move = equations.step(damping)
+        return State(q, equations, damping, move, moves & (equations.promised(move) > enough))
 
     def step(state: State) -> State:
-        move = state.equations.step(state.damping)
-        moves = state.moves & (state.equations.promised(move) > enough)
-        trial = xp.where(moves[..., None], state.q + move, state.q)
-        new = equations(trial)
+        trial = xp.where(state.moves[..., None], state.q + state.move, state.q)
+        new, old = equations(trial), state.equations
         finite = xp.isfinite(new.gradient).all(-1)
-        better = moves & finite & (new.objective <= state.equations.objective)
+        better = state.moves & finite & (new.objective <= old.objective)
         damping = xp.where(better, state.damping * 0.2, xp.maximum(state.damping, 1e-6) * 10)
-        q, *kept = chosen(better, (trial, *new), (state.q, *state.equations))
-        return State(q, NormalEquations(*kept), damping, moves)
+        q, *kept = chosen(better, (trial, *new), (state.q, *old))
+        return proposed(q, NormalEquations(*kept), damping, state.moves)
 
-    return repeated(step, state, lambda state: state.moves, steps)
+    damped, finite = xp.full_like(first.objective, damping), xp.isfinite(first.objective)
+    return repeated(step, proposed(start, first, damped, finite), steps)
 
 
 def chosen(
@@ -119,21 +126,16 @@ def chosen(
     return [xp.where(rows.reshape(rows.shape + (1,) * (a.ndim - rows.ndim)), a, b) for a, b in of]
 
 
-def repeated(
-    step: Callable[[State], State],
-    state: State,
-    goes_on: Callable[[State], Bool[AnyArray, "*row"]],
-    steps: int,
-) -> State:
+def repeated(step: Callable[[State], State], state: State, steps: int) -> State:
     """Steps until no row moves: a loop of Python for NumPy, one of JAX for JAX."""
-    if isinstance(goes_on(state), np.ndarray | np.bool_):
+    if namespace(state.moves) is np:
         for _ in range(steps):
-            state = step(state)
-            if not goes_on(state).any():
+            if not state.moves.any():
                 break
+            state = step(state)
         return state
     _, state = jax.lax.while_loop(
-        lambda of: (of[0] < steps) & goes_on(of[1]).any(),
+        lambda of: (of[0] < steps) & of[1].moves.any(),
         lambda of: (of[0] + 1, step(of[1])),
         (0, state),
     )
