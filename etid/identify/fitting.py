@@ -442,9 +442,24 @@ def remarks_on(seen: Inspected, estimator: AbstractEstimator) -> int:
     return int(seen.remarks | (Remark.current_unused if unused else 0))
 
 
-def whole(parts: Sequence[Fit]) -> Fit:
-    """Fits that are stacked in parts, in one."""
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+def fits_of(
+    lanes: Sequence[AbstractLane],
+    driver: AbstractFeed,
+    known: Any,
+    circuit: AbstractCircuit,
+    estimator: AbstractEstimator,
+    total: int = 1,
+) -> Fit:
+    """Fits of lanes of one shape, stacked; `total` is their number here and in other calls."""
+    of = driver, known, circuit, estimator
+    rows = ROWS and jax.default_backend() == "cpu"
+    if rows and isinstance(estimator, MaximumLikelihood):
+        parts = estimator.fit_rows(lanes, *of[:-1])
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    if not worth_compiling(total, lanes[0].periodic):
+        return stacked(jax.device_get([skin(lane, *of) for lane in lanes]))
+    fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
+    return taken(fits, np.arange(len(lanes)))  # without the padding
 
 
 class Batch:
@@ -487,20 +502,11 @@ class Batch:
         known = known_of(first, driver, shared, estimator)
 
         def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
-            def fitted_with(known: Any) -> Fit:
-                of = driver, known, circuit, estimator
-                rows = ROWS and jax.default_backend() == "cpu"
-                if rows and isinstance(estimator, MaximumLikelihood):
-                    return whole(estimator.fit_rows(lanes, *of[:-1]))
-                if not worth_compiling(total, lanes[0].periodic):
-                    return stacked(jax.device_get([skin(lane, *of) for lane in lanes]))
-                fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
-                return taken(fits, np.arange(len(lanes)))  # without the padding
-
-            found = fitted_with(known)
+            found = fits_of(lanes, driver, known, circuit, estimator, total)
             if not isinstance(known, GivenDriver) or not has_open_resonance(driver):
                 return found
-            return likelier(found, fitted_with(dataclasses.replace(known, aside=np.asarray(ASIDE))))
+            aside = dataclasses.replace(known, aside=np.asarray(ASIDE))
+            return likelier(found, fits_of(lanes, driver, aside, circuit, estimator, total))
 
         found = refitted_loads(self.lanes, self.seen, fit, driver, candidates)
         return judged(found, driver, self.seen, estimator)

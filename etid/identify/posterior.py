@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_limits import Limits, of_circuit
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
+from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, taken
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
@@ -40,7 +40,7 @@ from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import minimum as least
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
-from etid.identify.fitting import is_shared, known_of, skin
+from etid.identify.fitting import fits_of, is_shared, known_of
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
@@ -287,8 +287,8 @@ def given(
     elements = ElementPrior.of(estimator.known_elements, fit.circuit)
     if estimator.bounds:  # the draws begin with those of the same fit without bounds
         unbounded = dataclasses.replace(estimator, bounds=())
-        of = jax.device_get(skin(lane, feed, known, fit.circuit, unbounded))
-        cov = _determined(of)
+        of = fits_of([lane], feed, known, fit.circuit, unbounded)
+        cov = _determined(taken(of, 0))
     return lane, Known(known, elements, of_circuit(estimator.bounds, fit.circuit)), cov
 
 
@@ -348,6 +348,6 @@ def _effects(fit: Fit, recording: Recording | None, driver: Driver | None) -> Ef
         )
     lane, known, _ = given(fit, recording, driver)
     estimator = named(fit.method)
-    found = jax.device_get(skin(lane, driver, known.driver, fit.circuit, estimator))
+    found = taken(fits_of([lane], driver, known.driver, fit.circuit, estimator), 0)
     assert found.by_tolerance is not None
     return found.by_tolerance
