@@ -1,0 +1,43 @@
+"""Rows of NumPy answer as the traced program of one recording, whatever disturbs a recording."""
+
+import numpy as np
+import pytest
+
+import etid
+from benchmarks import perturbation_list, perturbed_study
+from etid.identify import fitting
+
+DISTURBED = (
+    *("base", "gain_out_+1%_skin", "crosstalk_1%_unloaded", "capacitance_5pF_skin"),
+    *("lowpass_80kHz_skin", "Rp_nonlinear_0.2", "cole_alpha0.8", "two_rc_mid"),
+    *("inductance_5mH_skin", "driver_Rprot_x1.05", "tail_5mV_5ms_skin", "driver_Vp_+2%_out_vs_th"),
+    *("hum60_0.02V_out_skin_only", "delay_0.9_samples_skin"),
+)
+
+
+def test_every_disturbance_of_the_list_has_its_name():
+    assert set(DISTURBED) <= set(perturbation_list.PERTURBATIONS)
+
+
+@pytest.mark.parametrize(
+    ("number", "snr_db"),
+    [(0, 60.0), *(pytest.param(n, s, marks=pytest.mark.slow) for n, s in ((1, 40.0), (2, 30.0)))],
+)
+def test_rows_have_the_verdicts_and_elements_of_the_program(number, snr_db, monkeypatch):
+    """A drawn driver, dry and damp skin. Both searches end within a twentieth of an error."""
+    base = perturbed_study.undisturbed(number, snr_db)
+    driver = etid.identify_driver(base.recordings()["calibration/98k8"], throw=False)
+    records = []
+    for name in DISTURBED:
+        disturbed = perturbation_list.change_of(name)(base).recordings()
+        records += [disturbed["dry"], disturbed["damp"]]
+    found = etid.identify_skins(records, driver)
+    monkeypatch.setattr(fitting, "ROWS", False)
+    expected = etid.identify_skins(records, driver)
+    np.testing.assert_array_equal(found.verdicts, expected.verdicts)
+    np.testing.assert_array_equal(found.fit.remarks, expected.fit.remarks)
+    values, others = (np.asarray(of.circuit.values()) for of in (found, expected))
+    errors = np.sqrt(np.diagonal(np.asarray(expected.cov), axis1=1, axis2=2))
+    assert np.max(np.abs(values - others) / errors) < 0.05
+    np.testing.assert_allclose(found.cov, expected.cov, rtol=0.02, atol=0)
+    assert len(set(found.verdicts.tolist())) > 2
