@@ -66,6 +66,7 @@ class Group:
         self._exact: dict[int, float] = {}
         self._aliases: dict[int, tuple[Aliases, Aliases]] = {}
         self._noises: dict[tuple[bool, int, int], Noise] = {}
+        self._floored: dict[tuple[int, int], Noise] = {}
 
     @functools.cached_property
     @quietly()
@@ -263,9 +264,12 @@ class Group:
     @quietly()
     def noise_of_quiet(self, periods: int, samples: int) -> Noise:
         """The noise of `quiet`: at least the rounding and the error of the interpolation."""
-        noise = self._noise(self.quiet, periods, samples)
-        least = floor(self.limits, self.step)[..., None] ** 2 / samples
-        return noise._replace(power=np.maximum(noise.power, least))
+        if (periods, samples) not in self._floored:
+            noise = self._noise(self.quiet, periods, samples)
+            least = floor(self.limits, self.step)[..., None] ** 2 / samples
+            power = np.maximum(noise.power, least)
+            self._floored[periods, samples] = noise._replace(power=power)
+        return self._floored[periods, samples]
 
     @quietly()
     def spectra(self, periods: int, samples: int) -> tuple[np.ndarray, ...]:
