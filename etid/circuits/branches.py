@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit, impedance_at
 from etid.circuits.impedance import AbstractConnection, AbstractImpedance
+from etid.precision import namespace
 
 # Places of the elements of a branch. In two branches that can be exchanged, those with the same
 # number correspond.
@@ -49,8 +50,8 @@ def in_order(
             now = logs[places]
             wrong = _log_time(circuit, now, one) > _log_time(circuit, now, other)
             for of in told:
-                wrong = wrong & jnp.all(of[np.array(one)] == of[np.array(other)])
-            places = jnp.where(wrong, places[swap], places)
+                wrong = wrong & (of[np.array(one)] == of[np.array(other)]).all()
+            places = namespace(logs, *told).where(wrong, places[swap], places)
     return places
 
 

@@ -7,10 +7,12 @@ of the fit. Standard errors contain it like any measurement. A fixed element has
 from collections.abc import Sequence
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.precision import Module
+from etid.precision import Module, namespace
+from etid.signals.transfer import AnyArray
 
 FIXED = 1e-9  # standard deviation of the logarithm of a fixed element, below all errors of a fit
 
@@ -26,8 +28,8 @@ class ElementPrior(Module):
         width: Standard deviations of the logarithms; infinite for elements without a prior.
     """
 
-    told: Float[Array, " element"]
-    width: Float[Array, " element"]
+    told: Float[AnyArray, " element"]
+    width: Float[AnyArray, " element"]
 
     @classmethod
     def of(cls, known: Known, circuit: AbstractCircuit) -> "ElementPrior | None":
@@ -36,20 +38,19 @@ class ElementPrior(Module):
             return None
         checked(known, circuit)
         names = circuit.names()
-        told, width = jnp.ones(len(names)), jnp.full(len(names), jnp.inf)
+        told, width = np.ones(len(names)), np.full(len(names), np.inf)
         for name, mean, deviation in known:
             row = names.index(name)
-            told = told.at[row].set(mean)
-            width = width.at[row].set(max(deviation / mean, FIXED))
+            told[row], width[row] = mean, max(deviation / mean, FIXED)
         return cls(told, width)
 
     @property
-    def centre(self) -> Float[Array, " element"]:
+    def centre(self) -> Float[AnyArray, " element"]:
         """Means of the logarithms; 0 for elements without a prior."""
-        return jnp.log(self.told)
+        return namespace(self.told).log(self.told)
 
     @property
-    def precision(self) -> Float[Array, " element"]:
+    def precision(self) -> Float[AnyArray, " element"]:
         """1/width²."""
         return 1 / self.width**2
 
