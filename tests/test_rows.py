@@ -87,6 +87,17 @@ def test_a_row_that_is_not_a_number_spoils_no_other(study, driver):
     assert np.isnan(found.chi2[1])
 
 
+@np.errstate(all="ignore")  # no resistor is like these skins: its fit is a misfit
+def test_rows_of_a_resistor_move_one_by_one(study, driver):
+    """Its impedance is one number at all frequencies; rows that have settled stay as they are."""
+    load = loads(study, driver, etid.Resistor())
+    together = minimum(load, starts(load))
+    assert len(set(together.points.tolist())) > 1
+    for number in range(len(load.records.x)):
+        alone = loads(study, driver, etid.Resistor(), slice(number, number + 1))
+        same(minimum(alone, starts(alone)).q[0], together.q[number])
+
+
 def test_jax_runs_the_same_text_to_the_same_iterates(study, driver):
     load = loads(study, driver)
     start = starts(load)

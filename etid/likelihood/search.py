@@ -365,11 +365,14 @@ def taken(of: _Arrays, rows: np.ndarray) -> _Arrays:
 
 
 def replaced(of: _Arrays, rows: np.ndarray, by: _Arrays) -> _Arrays:
-    """All arrays, some rows of which are replaced; the arrays are changed in place."""
-    leaves, others = jax.tree.leaves(of), jax.tree.leaves(by)
-    for leaf, other in zip(leaves, others, strict=True):
+    """All arrays, some rows of which are replaced."""
+
+    def one(leaf: np.ndarray, other: np.ndarray) -> np.ndarray:
+        leaf = leaf.copy()  # the impedance of a resistor is one number at all frequencies
         leaf[rows] = other
-    return of
+        return leaf
+
+    return jax.tree.map(one, of, by)
 
 
 def select(rows: Bool[AnyArray, "*row"], new: _Arrays, old: _Arrays) -> _Arrays:
