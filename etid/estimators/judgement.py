@@ -17,10 +17,12 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
+from etid.precision import namespace
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Support
 from etid.results.instrument import Effects
 from etid.results.verdicts import RESULTS, first_verdict, verdict
+from etid.signals.transfer import AnyArray
 from etid.solvers.levenberg_marquardt import NormalEquations
 from etid.solvers.matrices import inverse
 
@@ -42,16 +44,17 @@ BIASED = 16.0  # squared standard errors from an estimate to the minimum of its 
 
 
 def misses(
-    chi2: Float[Array, ""],
-    error: Float[Array, ""],
+    chi2: Float[AnyArray, "*row"],
+    error: Float[AnyArray, "*row"],
     least: float = MISFIT_RRSE,
     limit: float = MISFIT_CHI2,
-) -> Bool[Array, ""]:
+) -> Bool[AnyArray, "*row"]:
     """Whether the residual exceeds the noise, both in standard deviations and in volts.
 
     A part `least` of the signal may remain unexplained, and noise explains a χ² of `limit`.
     """
-    excess = error * jnp.sqrt(jnp.maximum(1 - 1 / chi2, 0.0))
+    xp = namespace(chi2, error)
+    excess = error * xp.sqrt(xp.maximum(1 - 1 / chi2, 0.0))
     return (chi2 > limit) & (excess > least)
 
 

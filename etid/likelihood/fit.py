@@ -18,9 +18,7 @@ from etid.results.instrument import BUDGETED, Effects
 from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex, power
 
-FAULTS = (
-    3  # errors of the instrument that act on the record of a load: gain, crosstalk, capacitance
-)
+FAULTS = 3  # errors of the instrument that act on a load: gain, crosstalk, capacitance
 SEEN = 3.9  # standard deviations; a normal number exceeds it once in 10 000
 # The fast relaxations have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for six poles), so that
 # this is in fact `SEEN`.
@@ -120,10 +118,8 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
     tested, last = scores.smooth(linear, condensed.rows(changes), e), changes.shape[-3]
     circuits, first = 2 + directions.RELAXATIONS, last - outputs
     layer, spreads = tested.of_changes(0), tested.of_changes(1)
-    relaxations, scales = (
-        tested.of_changes(slice(2, circuits)),
-        tested.of_changes(slice(first, last)),
-    )
+    relaxations = tested.of_changes(slice(2, circuits))
+    scales = tested.of_changes(slice(first, last))
     crosstalk, capacitance = tested.of_changes(circuits), tested.of_changes(circuits + 1)
     gain = scales.of_changes(0)
     added = directions.falling(near, every)
@@ -159,8 +155,7 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
     proven = gain.exceeds(SEEN, MOVED)
     doubtful = (xp.abs(gain.z) > DOUBTED) & ~proven
     mean = gain.size / (1 + (gain.stderr / GAIN) ** 2)
-    shift = xp.where(doubtful, mean, 0.0)[..., None] * gain.slope
-    shift = xp.where(doubtful[..., None], shift, 0.0)
+    shift = xp.where(doubtful[..., None], mean[..., None] * gain.slope, 0.0)
     shared = shared + shift[..., :, None] * shift[..., None, :]
     # For an element without any effect the matrix product contains only rounding errors.
     variance = diagonal(elements[..., :e])

@@ -18,6 +18,7 @@ from etid.estimators.maximum_likelihood.condensed import Condensed, Near, Slopes
 from etid.estimators.maximum_likelihood.profile import Profile, Records, excess, total
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
+from etid.likelihood.fit import FAULTS
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.results.instrument import Instrument
 from etid.signals.harmonics import Spectrum, same_unloaded
@@ -25,7 +26,6 @@ from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
 from etid.solvers.matrices import inverse_root
 
-FAULTS = 3  # errors of the instrument that change loads directly: gain, crosstalk, capacitance
 DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 
 

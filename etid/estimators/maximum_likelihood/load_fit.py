@@ -31,6 +31,7 @@ from etid.estimators.maximum_likelihood.search import best_start, minimum
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import SEEN, falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.fit import FAR, NO_HUM, UNSEEN
 from etid.results.driver import HarmonicDriver
 from etid.results.fit import Fit, Support
 from etid.results.instrument import BUDGETED, Effects
@@ -38,12 +39,6 @@ from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, combined, power
 from etid.solvers.matrices import inverse_root, root
-
-# Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
-# 200 fits were wrong by five standard errors; both exceed it.
-FAR = 0.5
-UNSEEN = 1e-3  # of the variance of its prior, below which a recording tells nothing about an error
-NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
 
 
 class Found(NamedTuple):

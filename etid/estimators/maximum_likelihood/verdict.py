@@ -15,24 +15,16 @@ from jaxtyping import Bool, Float
 from etid.circuits.branches import exchangeable, in_order
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits, Within, limited, of_circuit, within
+from etid.estimators.element_prior import FIXED
+from etid.estimators.judgement import STRAINED, SUCCESSFUL, misses
 from etid.estimators.lanes import stacked, taken
 from etid.likelihood.fit import Estimate
 from etid.likelihood.linear import diagonal
 from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Limited
-from etid.results.verdicts import RESULTS, verdict, verdicts_of
+from etid.results.verdicts import RESULTS, verdicts_of
 
-GOOD = verdict("successful")
-
-MISFIT_CHI2 = 1.5  # the record gives the noise to about 5 %, so χ² is known to 10 %
-# Of the signal; the best converters and transformers leave this part unexplained.
-MISFIT_RRSE = 1e-3
-# Increase of the calibrations' sum of squares. Its distribution is chi-squared. The degrees of
-# freedom are at most the number of parameters of Z_th and the delays. With 12 degrees of freedom
-# the increase exceeds this value once in ten thousand.
-STRAINED = 39.0
-FIXED = 1e-9  # standard deviation of the logarithm of a fixed element, below all errors of a fit
 STEEP = 4.0  # standard errors by which an exponent exceeds 1: by chance once in 30 000
 STEP = 1e-5  # of the logarithm of an element, for the slope of an exponent
 
@@ -75,12 +67,13 @@ def judged(
         sound = np.isfinite(inside).all(-1, keepdims=True)
         values = np.where(sound, inside, values)
     values = np.where(width <= FIXED, told, values)
+    late = (np.abs(found.delays) > 1).any(-1)  # the model holds for delays of up to one sample
     verdicts = (
         (~np.isfinite(found.chi2), "unstable"),
         (~np.isfinite(values).all(-1), "nonphysical"),
         (_too_steep(circuit, found), "nonphysical"),
         (~found.settled, "max_steps_reached"),
-        (_misses(found), "misfit"),
+        (misses(found.chi2, found.rrse) | late, "misfit"),
         (found.falls, "misfit"),  # which can pass for a change of the driver
         (found.strain > STRAINED, "inconsistent"),
         (contradicted, "out_of_bounds"),
@@ -88,7 +81,7 @@ def judged(
         # parameter: files of fits hold positive elements where a fit is successful.
         (~((errors > 0) & (errors < 1) & (values > 0)).all(-1), "insensitive"),
         (
-            np.full(len(values), np.asarray(driver._value) != np.asarray(GOOD._value)),
+            np.full(len(values), np.asarray(driver._value) != np.asarray(SUCCESSFUL._value)),
             "driver_failed",
         ),
         (found.inconsistent | changed, "inconsistent"),
@@ -145,17 +138,6 @@ def _limits(
     assert found is not None
     lower, upper = (np.tile(end, (count, 1)) for end in (found.lower, found.upper))
     return Limited(lower, upper, outside)
-
-
-def _misses(found: Estimate) -> Bool[np.ndarray, " row"]:
-    """Whether the residual exceeds the noise, both in standard deviations and in volts.
-
-    A part `MISFIT_RRSE` of the signal may remain unexplained, and noise explains a χ² of
-    `MISFIT_CHI2`. The model holds for a trigger delay of up to one sample.
-    """
-    excess = found.rrse * np.sqrt(np.maximum(1 - 1 / found.chi2, 0.0))
-    missed = (found.chi2 > MISFIT_CHI2) & (excess > MISFIT_RRSE)
-    return missed | (np.abs(found.delays) > 1).any(-1)
 
 
 def _too_steep(circuit: AbstractCircuit, found: Estimate) -> Bool[np.ndarray, " row"]:

@@ -18,6 +18,8 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.estimators.maximum_likelihood.condensed import Near
 from etid.estimators.score_tests import SEEN
 from etid.estimators.score_tests.other_circuit import MOVED, Fitted
+from etid.likelihood.directions import FINE, HARMONICS
+from etid.likelihood.fit import SHARE, UNSURE
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, power, reciprocal
 
@@ -25,10 +27,6 @@ NO_FALL = (  # for a methods section
     "a score test finds no resistance of the load that falls with its current (at most "
     f"{SEEN:g} standard deviations)"
 )
-SHARE = 0.5  # of the excess of χ², from which on the current is named as the cause of a misfit
-UNSURE = 4.0  # standard deviations of χ² that are no excess
-HARMONICS = 512  # that the pulse needs, up to 30 kHz; without the rest z is a few per cent smaller
-FINE = 2  # points of the grid in time, relative to twice the number of these harmonics
 
 
 class Falling(NamedTuple):

@@ -37,17 +37,9 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import SEEN
+from etid.likelihood.fit import DOUBTED, GAIN, MOVED, SCALE, SEEN_RELAXATION, SPREAD
 from etid.signals.transfer import AnyArray, as_complex, combined, frequency_variable
 
-# Standard deviations. The fast relaxations have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for
-# six poles), so that 5 is in fact `SEEN`.
-SEEN_RELAXATION = 5.0
-# α or ε must also deviate by this, which changes R_s by a few per cent. A driver whose order is too
-# low can imitate 0.002: four standard deviations at 60 dB with damp skin.
-SPREAD = 0.01
-DOUBTED = 2.5  # standard deviations of a gain that goes into ±; one good recording in 80 has them
-GAIN = 0.02  # standard deviation of the gain between two channels that nobody compared
-MOVED = 0.02  # relative change of an element that is also necessary, for the same reason
 # For a methods section.
 NO_OTHER_CIRCUIT = (
     "score tests find no relaxation of the load that is spread over time constants (at most "
@@ -57,9 +49,6 @@ NO_OTHER_GAIN = (
     "a score test finds no difference between the gains of the two records (at most "
     f"{SEEN:g} standard deviations)"
 )
-# Relative change of an element, from which on the scale of a current measured beside V_th is wrong.
-# A driver of too low order can imitate less.
-SCALE = 1e-3
 GRID = 7  # time constants, two per decade; a relaxation is wider than that
 BEYOND = 2.0  # factor by which they exceed the band
 # Faster relaxations of a layer of diffusion, by √(τ₁/τ). The rest adds 3 % of R_p to R_s.
