@@ -25,14 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid.likelihood.noise import HUM, LOW, SURE
 from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum, local_sum, real_parts, signal_share
 from etid.signals.mains import lines
 from etid.signals.transfer import as_complex, power
-
-SURE = 4.0  # standard deviations by which a local variance must exceed the mean
-LOW = 128  # number of first harmonics that are tested for mains hum
-HUM = 14.4  # times the mean; an exponential exceeds it as rarely as a normal number exceeds five σ
 
 
 class Records(eqx.Module):

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.profile import excess
+from etid.likelihood.unloaded import OTHER, SAME_FREQUENCY, SEEN, SIZE, SMOOTH
 from etid.results.driver import HarmonicDriver
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, power, turns
@@ -28,16 +29,9 @@ from etid.signals.transfer import as_complex, power, turns
 DEGREE = 6  # polynomials of δ; its real part has no constant, because that is the amplitude
 FIRST = 6  # first harmonics, which are not used because of hum and drift
 SIGNAL = 0.9  # smallest share of signal in the power around a harmonic that is used
-SEEN = 37.37  # χ² that all directions exceed by chance in `FALSE_ALARMS`
-SIZE = 1.5e-4  # smallest difference relative to V_th; pulses repeat no better than this
 # Difference that the drift of a driver makes, relative to the drift. It is three times the standard
 # deviation by an inductance, which has the largest effect.
 DRIFT = 0.2
-OTHER = 0.1  # difference relative to V_th of another pulse; doubling a part has less effect
-SMOOTH = 1 / 3  # part of the difference that must be smooth
-# Relative difference of pulse rates. Records of other lengths are cut to other whole samples. This
-# moves the zeros of a pulse at its thousandth harmonic as much as a part that has changed.
-SAME_FREQUENCY = 1e-6
 
 
 class UnloadedShape(NamedTuple):
