@@ -60,14 +60,13 @@ def in_python():
     study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
     driver = etid.identify_driver(study["calibration/98k8"], order=5)
     fit = etid.identify_skin(study["typical/dry/01"], driver)
-    assert not compiled, f"the example of the README compiles {compiled}"
     assert fit.verdict == "successful"
     for name, true in TRUTH.items():
         error = abs(float(getattr(fit.circuit, name)) - true)
         assert error < 5 * float(getattr(fit.stderr, name)), name  # 1 in 10⁶ by chance
     skins = [study[path] for path in study if path.startswith("typical")]
-    batch = etid.identify_skins(skins * 50, driver)  # so large that XLA compiles it
-    assert compiled, "XLA compiles a large batch"
+    batch = etid.identify_skins(skins * 50, driver)
+    assert not compiled, f"small work compiles {compiled}"
     assert batch.counts()["successful"] >= 450, batch.counts()  # one of ten is a false alarm
 
 
