@@ -41,8 +41,7 @@ from benchmarks.runner import (
     tabled,
 )
 from benchmarks.spice import DATA
-from etid.recordings.group import Group
-from etid.recordings.preflight import Inspected, preflight
+from etid.recordings.preflight import inspected, preflight
 from etid.simulation.scenes import INSTRUMENTS
 
 SKINS = 30  # of the other simulator
@@ -81,9 +80,7 @@ def inspection(records: int = 30, rounds: int = 15) -> float:
     times = []
     for _ in range(rounds + 1):
         begin = time.process_time()
-        group = Group(every)
-        for number, one in enumerate(every):
-            seen = Inspected(one, group, number)
+        for seen in inspected(every):
             assert preflight(seen, periodic=True) is None
             assert seen.remarks is not None
         times.append(time.process_time() - begin)

@@ -8,12 +8,29 @@ from scipy.signal import czt
 
 import etid
 from etid.recordings.preflight import Inspected
-from etid.signals.averaging import PLACES, Aliases, Periods, left, weighted, weights
+from etid.signals.averaging import (
+    PLACES,
+    Aliases,
+    aliases_of,
+    left,
+    longer,
+    weighted,
+    weights,
+)
 from etid.signals.harmonics import harmonics
+from etid.signals.periods import Periods
 from etid.simulation.scenes import Electronics
 from tests.skins import off
 
 RATE, PULSES = 200e3, 60.0
+
+
+def periods_of(v, spacing, periods):
+    return Periods.of(v[None], spacing * np.arange(periods)[None], RATE / PULSES)
+
+
+def beyond(power, fall):
+    return Aliases(np.array(power), np.array(fall), np.array(fall))
 
 
 def sampled(spacing, samples, highest):
@@ -36,8 +53,9 @@ def test_the_weighted_mean_has_no_aliases(periods, highest, ppm):
     samples = round(periods * RATE / PULSES)
     both, gain = sampled(spacing, samples, highest)
     noise = np.full(samples // (2 * periods), 1e-14)
-    aliases = Periods.of(both[0], spacing, periods).aliases(noise)
-    assert aliases is not None
+    of = periods_of(both[0], spacing, periods)
+    aliases = aliases_of(of, np.array([spacing]), noise[None]).take(0)
+    assert aliases.power > 0
     by = weights(spacing, periods, noise[: PLACES.size], aliases)
     errors = []
     for x, y in (
@@ -57,21 +75,23 @@ def test_the_clock_is_known_to_a_hundredth_of_a_sample(ppm):
     scene = etid.scenes.paper_dry(antialias=3.5, snr_db=60.0, samples=20_000, pulse_rate_ppm=ppm)
     scene = dataclasses.replace(scene, trials=scene.trials[:1])
     one = scene.simulate(seed=0)[scene.trials[0].path]
-    found = Periods.of(np.asarray(one.v_th), RATE / PULSES, 6).longer()
+    of = periods_of(np.asarray(one.v_th), RATE / PULSES, 6)
+    [found], [error] = longer(of, np.array([RATE / PULSES]))
+    assert error < 0.001
     assert found == pytest.approx(-RATE / PULSES * 1e-6 * ppm, abs=0.002)
 
 
 def test_weights_are_equal_where_the_clock_needs_no_others():
     noise = np.ones(PLACES.size)
-    np.testing.assert_allclose(weights(3333 + 1 / 3, 6, noise, Aliases(1.0, 8.0, 8.0)), 1 / 6)
+    np.testing.assert_allclose(weights(3333 + 1 / 3, 6, noise, beyond(1.0, 8.0)), 1 / 6)
     # Aliases that cannot be told from the signal, or do not exceed the noise.
-    np.testing.assert_allclose(weights(3333.0, 4, noise, Aliases(1.0, 8.0, 8.0)), 1 / 4)
-    np.testing.assert_allclose(weights(3333.1, 4, noise, Aliases(1e-14, 8.0, 8.0)), 1 / 4)
+    np.testing.assert_allclose(weights(3333.0, 4, noise, beyond(1.0, 8.0)), 1 / 4)
+    np.testing.assert_allclose(weights(3333.1, 4, noise, beyond(1e-14, 8.0)), 1 / 4)
 
 
 def test_noise_is_not_enlarged_for_aliases_below_it():
     """To remove those of twice the sample rate, too, would cost 26 times the power of the noise."""
-    aliases = Aliases(0.02, 9.0, 9.0)
+    aliases = beyond(0.02, 9.0)
     by = weights(3333.466, 6, np.ones(PLACES.size), aliases)
     assert (6 * np.square(by).sum(-1) + left(by, 3333.466, aliases)).max() < 1.2
 

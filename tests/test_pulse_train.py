@@ -100,7 +100,7 @@ def test_the_drift_is_from_the_first_pulse_to_the_last():
     first, last = train.edges[[0, -1]]
     assert first > 2500
     records, sigma = np.stack([one.v_th, other.v_out])[None], np.full((1, 2), 1e-3)
-    [drift] = clocks_apart(records, sigma, [train], [0.0])
+    [drift] = clocks_apart(records, sigma, [train], np.zeros(1))
     # Its sign is that of a later pulse. A slower clock by 0.01 % of its own is 0.01 % of this.
     assert abs(drift) == pytest.approx(1e-4 * (last - first), rel=0.03)
 

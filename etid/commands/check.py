@@ -11,7 +11,8 @@ from etid.identify.options import instrument_of
 from etid.recordings import hdf5
 from etid.recordings.causes import how_shifted, sizes
 from etid.recordings.errors import RecordingError
-from etid.recordings.preflight import Inspected, is_plausible
+from etid.recordings.faults import is_plausible
+from etid.recordings.preflight import Inspected
 from etid.recordings.study import Study
 from etid.results.verdicts import message
 

@@ -25,7 +25,7 @@ from etid.identify.fitting import FEWEST, Batch, Prepared, is_shared
 from etid.identify.options import Options, check_default, plan
 from etid.precision import in_float64
 from etid.recordings.causes import why_implausible, why_misaligned, why_rates_differ
-from etid.recordings.preflight import Group, Inspected, preflight
+from etid.recordings.preflight import Inspected, inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit, IdentificationError, Support
@@ -127,9 +127,10 @@ def _inspected(
         together = max(1, TOGETHER // max(1, several[0][1].samples["v_out"].stored.size))
         for first in range(0, len(several), together):
             part = several[first : first + together]
-            group = Group([of for _, of, _ in part])
-            for number, (row, of, driver) in enumerate(part):
-                yield row, Inspected(of, group, number), driver
+            for (row, _, driver), seen in zip(
+                part, inspected([of for _, of, _ in part]), strict=True
+            ):
+                yield row, seen, driver
 
 
 def prefetch(

@@ -119,7 +119,7 @@ def _why_no_power(inspected: Inspected) -> str:
 
 def _lag(inspected: Inspected, v_out: Float[np.ndarray, " time"]) -> float | None:
     (lag,) = lags_of(np.stack([inspected.v_th, v_out])[None], [inspected.train])
-    return lag
+    return float(lag) if np.isfinite(lag) else None
 
 
 def _is_passive(current: Float[np.ndarray, " time"], v_out: Float[np.ndarray, " time"]) -> bool:

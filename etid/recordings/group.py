@@ -6,32 +6,34 @@ from collections.abc import Hashable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Float, Int
 
+from etid.recordings import faults
+from etid.recordings.faults import covariance_of
 from etid.recordings.recording import Recording, Samples, quietly
-from etid.signals.averaging import PLACES, SURE, Aliases, Periods, left, weighted, weights
-from etid.signals.disturbances import (
-    Joint,
-    Shifts,
-    disturbed,
-    enough,
-    joint,
-    of_source,
-    shifts,
+from etid.signals.averaging import (
+    PLACES,
+    Differing,
+    differing_aliases,
+    left,
+    weighted,
+    weights,
 )
+from etid.signals.disturbances import Joint, Shifts, disturbed, kept
+from etid.signals.filtering import TAPS
 from etid.signals.harmonics import (
-    COHERENT,
     filled,
     harmonics,
-    separates_aliases,
     whole_periods,
 )
 from etid.signals.mains import Hum, separated
 from etid.signals.noise import Noise, floor, noise_of
+from etid.signals.periods import Periods
 from etid.signals.pulse_train import (
     PulseTrain,
     clocks_apart,
     lags_of,
+    largest_drift,
     pulse_trains,
     rise_time,
 )
@@ -39,34 +41,29 @@ from etid.signals.quick_looks import humming, shows_few, uneven
 from etid.signals.rounding import VISIBLE, is_coarse, step_of
 
 _Key = TypeVar("_Key", bound=Hashable)
-SEAM = 3  # samples on each side of the joint between two periods
-MOVED = 0.05  # [samples] of the last period, from which on its place matters without aliases
-LEAK = 0.1  # part of the noise that aliases on a harmonic may have
-BY_CHANCE = 4.0  # [standard deviations] largest difference that noise makes
+_Rows = Int[np.ndarray, " row"]
+_Holds = Bool[np.ndarray, " row"]
+SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 
 
 class Group:
-    """Recordings of equal length and equal rates, inspected together to save time.
+    """Recordings of equal length and rates that hold equal numbers of periods, inspected together.
 
     Each property has one entry for each recording and is computed once, when it is used. An axis of
     length 2 holds `v_th` and `v_out`. In recordings of a measured current, the current is in the
     place of `v_th`, here and below, and its unit is the ampere.
 
     Args:
-        recordings: The recordings.
-        cut: Largest error of the places at which their periods begin [samples].
+        recordings: The recordings; `together` puts them into groups.
     """
 
-    def __init__(self, recordings: Sequence[Recording], cut: float = 0.0) -> None:
+    def __init__(self, recordings: Sequence[Recording]) -> None:
         self.recordings = recordings
-        self._cut = cut
         self.sample_rate = recordings[0].sample_rate
         self.pulse_rate = recordings[0].pulse_rate
-        self._spectra: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
-        self._exact: dict[int, float] = {}
-        self._aliases: dict[int, tuple[Aliases, Aliases]] = {}
-        self._noises: dict[tuple[bool, int, int], Noise] = {}
-        self._floored: dict[tuple[int, int], Noise] = {}
+        self.has_current = recordings[0].cause == "current"
+        self._cut = 0.0  # largest error of the places at which the periods begin [samples]
+        self._cuts: dict[int, Periods] = {}
 
     @functools.cached_property
     @quietly()
@@ -80,14 +77,26 @@ class Group:
         whole.flags.writeable = False
         return whole
 
+    def part(self, rows: Sequence[int]) -> "Group":
+        """Some of the recordings."""
+        part = Group([self.recordings[row] for row in rows])
+        vars(part).update(whole=self.whole[rows], trains=[self.trains[row] for row in rows])
+        return part
+
     def joined(self, row: int, plan: Joint) -> "Group":
         """One of the recordings with the periods of a plan, as a group of its own."""
-        joined = Group([self.recordings[row]], cut=1.0)  # each period begins at a whole sample
+        joined = self.part([row])
         whole = plan(self.whole[row])[None]
         quiet = whole if self.quiet is self.whole else plan(self.quiet[row])[None]
-        periods = plan.first.size, whole.shape[2]
         vars(joined).update(
-            whole=whole, quiet=quiet, trains=[self.trains[row]], whole_periods=[periods]
+            whole=whole,
+            quiet=quiet,
+            periods=(plan.first.size, whole.shape[2]),
+            begins=plan.begins[None],
+            coarse=self.coarse[[row]],
+            apart=self.apart[[row]],
+            _periods=[(None, None)],
+            _cut=1.0,  # each period begins at a whole sample
         )
         return joined
 
@@ -100,26 +109,26 @@ class Group:
     @quietly()
     def noise(self) -> Float[np.ndarray, "recording 2"]:
         """Standard deviations of the noise of a sample of `whole` [V]; see `Noise.std`."""
-        found = np.zeros((len(self.recordings), 2))
-        whole = 1, self.whole.shape[2]
-        known = [
-            of if of[0] and not train.mismatch else whole
-            for of, train in zip(self.whole_periods, self.trains, strict=True)
-        ]
-        for (periods, samples), rows in _alike(known).items():
-            found[rows] = self._noise(self.whole, periods, samples).std(samples)[rows]
-        return np.maximum(found, self.step / math.sqrt(12.0))
+        of, samples = self._of_whole, self._shown[1]
+        if self.mismatch and self.periods[0]:
+            samples = self.whole.shape[2]
+            of = noise_of(self.whole, 1, samples)
+        return np.maximum(of.std(samples), self.step / math.sqrt(12.0))
 
-    def _noise(
-        self, records: Float[np.ndarray, "recording 2 time"], periods: int, samples: int
-    ) -> Noise:
-        """The noise of `whole` or of `quiet`."""
-        key = records is self.whole, periods, samples
-        if key not in self._noises:
-            lengths = [self.sample_rate / train.counted for train in self.trains]
-            rest = np.repeat(periods * np.array(lengths)[:, None] - samples, 2, axis=1)
-            self._noises[key] = noise_of(records, periods, samples, rest)
-        return self._noises[key]
+    @property
+    def _shown(self) -> tuple[int, int]:
+        """`periods`; less than a period is taken for one."""
+        return self.periods if self.periods[0] else (1, self.whole.shape[2])
+
+    @functools.cached_property
+    def _of_whole(self) -> Noise:
+        """The noise of `whole` at each harmonic."""
+        return self._noise(self.whole)
+
+    def _noise(self, records: Float[np.ndarray, "recording 2 time"]) -> Noise:
+        periods, samples = self._shown
+        rest = periods * self.counted_spacing - samples
+        return noise_of(records, periods, samples, np.repeat(rest[:, None], 2, axis=1))
 
     @functools.cached_property
     @quietly()
@@ -139,24 +148,30 @@ class Group:
         """Pulse trains of `v_th`."""
         return pulse_trains(self.whole[:, 0], self.sample_rate, self.pulse_rate)
 
+    @property
+    def mismatch(self) -> bool:
+        """Whether the pulses contradict the rates."""
+        return self.trains[0].mismatch != ""
+
     @functools.cached_property
-    def whole_periods(self) -> list[tuple[int, int]]:
-        """Numbers of whole periods in each recording, and their number of samples."""
-        size = self.whole.shape[2]
-        return [whole_periods(size, self.sample_rate, train.counted) for train in self.trains]
+    def counted_spacing(self) -> Float[np.ndarray, " recording"]:
+        """Length of a pulse period, from the measured pulse rate [samples]."""
+        return self.sample_rate / np.array([train.counted for train in self.trains])
+
+    @functools.cached_property
+    def periods(self) -> tuple[int, int]:
+        """Number of whole periods in each recording, and their number of samples."""
+        return whole_periods(self.whole.shape[2], self.sample_rate, self.trains[0].counted)
 
     @functools.cached_property
     @quietly()
     def hum(self) -> list[list[Hum | None]]:
         """Hum that is subtracted from each record; None if there is none."""
         found: list[list[Hum | None]] = [[None, None] for _ in self.recordings]
-        rates = self.sample_rate, self.pulse_rate
-        for of, rows in _alike(self.whole_periods).items():
-            suspect = humming(_part(self.whole, rows), self.noise[rows], *rates, *of)
-            for number, which in np.argwhere(suspect):
-                row = rows[number]
-                known = self.whole[row, which], float(self.noise[row, which]), self.sample_rate
-                found[row][which] = separated(*known, *of)
+        suspect = humming(self.whole, self.noise, self.sample_rate, self.pulse_rate, *self.periods)
+        for row, which in np.argwhere(suspect):
+            known = self.whole[row, which], float(self.noise[row, which]), self.sample_rate
+            found[row][which] = separated(*known, *self.periods)
         return found
 
     @functools.cached_property
@@ -201,33 +216,24 @@ class Group:
     def _periods(self) -> list[tuple[Joint | None, Shifts | None]]:
         """`kept` and `shifts`."""
         found: list[tuple[Joint | None, Shifts | None]] = [(None, None)] * len(self.recordings)
-        of_all = [
-            None if train.mismatch else (train.counted, periods)
-            for train, (periods, _) in zip(self.trains, self.whole_periods, strict=True)
-        ]
-        for key, rows in _alike(of_all).items():
-            if key is None:
-                continue
-            counted, periods = key
+        if self.mismatch:
+            return found
+        periods = self.periods[0]
+        for spacing, rows in _alike(self.counted_spacing.tolist()).items():
             of = _part(self.quiet, rows), self.noise[rows], self.coarse[rows]
-            spacing = self.sample_rate / counted
             for row in np.flatnonzero(uneven(*of, spacing, periods)):
                 records, sigma, step = (part[[row]] for part in of)
                 (bad,) = disturbed(records, sigma, step, spacing, periods)
-                found[rows[row]] = _kept(records[0], sigma[0], bad, spacing, self.sample_rate)
+                found[rows[row]] = kept(records[0], sigma[0], bad, spacing, self.sample_rate)
         return found
 
     @functools.cached_property
     @quietly()
-    def lags(self) -> list[float | None]:
-        """Lags of `v_out` in `quiet` [samples]; None if misaligned or if the rates are wrong."""
-        lags: list[float | None] = [None] * len(self.recordings)
-        rows = [row for row, train in enumerate(self.trains) if not train.mismatch]
-        if rows:
-            found = lags_of(_part(self.quiet, rows), [self.trains[row] for row in rows])
-            for row, lag in zip(rows, found, strict=True):
-                lags[row] = lag
-        return lags
+    def lags(self) -> Float[np.ndarray, " recording"]:
+        """Lags of `v_out` in `quiet` [samples]; NaN if misaligned or if the rates are wrong."""
+        if self.mismatch:
+            return np.full(len(self.recordings), np.nan)
+        return lags_of(self.quiet, self.trains)
 
     @functools.cached_property
     def trusted(self) -> Float[np.ndarray, "recording 2"]:
@@ -243,110 +249,189 @@ class Group:
     @functools.cached_property
     @quietly()
     def periodic(self) -> Bool[np.ndarray, " recording"]:
-        """`is_periodic` of each recording in `quiet`, with all its periods."""
-        found = np.zeros(len(self.recordings), bool)
-        for (periods, samples), rows in _alike(self.whole_periods).items():
-            if periods == 0:
-                continue
-            counted = np.array([self.trains[row].counted for row in rows])
-            rest = np.abs(periods * self.sample_rate / counted - samples)
-            rest = np.maximum(rest, self._cut)
-            records, sigma = _part(self.quiet, rows), self.trusted[rows]
-            found[rows] = is_periodic(records, sigma, rest, samples)
-            on_edge = ~is_periodic(records, sigma, np.ones(len(rows)), samples)
-            # Jitter of the last pulse looks like another pulse rate.
-            on_edge &= found[rows] & (counted != self.pulse_rate)
-            for row in np.flatnonzero(on_edge):
-                spacing = self.sample_rate / counted[row]
-                found[rows[row]] = _repeats(records[row], sigma[row], spacing, samples)
+        """`faults.is_periodic` of each recording in `quiet`, with all its periods."""
+        periods, samples = self.periods
+        if periods == 0:
+            return np.zeros(len(self.recordings), bool)
+        rest = np.maximum(np.abs(periods * self.counted_spacing - samples), self._cut)
+        found = faults.is_periodic(self.quiet, self.trusted, rest, samples)
+        on_edge = ~faults.is_periodic(self.quiet, self.trusted, np.ones(rest.size), samples)
+        # Jitter of the last pulse looks like another pulse rate.
+        on_edge &= found & (self.counted_spacing != self.sample_rate / self.pulse_rate)
+        for row in np.flatnonzero(on_edge):
+            of = self.quiet[row], self.trusted[row], float(self.counted_spacing[row])
+            found[row] = faults.begins_again(*of, samples)
         return found
 
+    @functools.cached_property
     @quietly()
-    def noise_of_quiet(self, periods: int, samples: int) -> Noise:
+    def spans(self) -> Float[np.ndarray, "recording 2"]:
+        """Peak-to-peak values in `quiet` [V]; infinite if they overflow."""
+        return self.limits[..., 1] - self.limits[..., 0]
+
+    @functools.cached_property
+    def flat(self) -> Bool[np.ndarray, "recording 2"]:
+        """Whether `v_th` and `v_out` carry no signal."""
+        return faults.flat(self.spans, self.covariance, self.noise)
+
+    @functools.cached_property
+    def clocks_differ(self) -> Bool[np.ndarray, " recording"]:
+        """Whether `v_out` drifts away from `v_th` from pulse to pulse."""
+        return ~np.asarray(self.has_current) & (
+            np.abs(self.apart) > largest_drift(self.sample_rate)
+        )
+
+    @functools.cached_property
+    @quietly()
+    def refused(self) -> list[str | None]:
+        """Names of the verdicts that forbid any fit, the first that applies; None if it is allowed.
+
+        Properties of a recording with one fault may have no meaning, and are not asked for.
+        """
+        names: list[str | None] = [None] * len(self.recordings)
+        left = np.arange(len(names))
+        for name, applies in _VERDICTS.items():
+            if left.size:
+                found = applies(self, left)
+                for row in left[found]:
+                    names[row] = name
+                left = left[~found]
+        return names
+
+    @functools.cached_property
+    @quietly()
+    def noise_of_quiet(self) -> Noise:
         """The noise of `quiet`: at least the rounding and the error of the interpolation."""
-        if (periods, samples) not in self._floored:
-            noise = self._noise(self.quiet, periods, samples)
-            least = floor(self.limits, self.step)[..., None] ** 2 / samples
-            power = np.maximum(noise.power, least)
-            self._floored[periods, samples] = noise._replace(power=power)
-        return self._floored[periods, samples]
+        noise = self._of_whole if self.quiet is self.whole else self._noise(self.quiet)
+        least = floor(self.limits, self.step)[..., None] ** 2 / self._shown[1]
+        return noise._replace(power=np.maximum(noise.power, least))
 
     @quietly()
-    def spectra(self, periods: int, samples: int) -> tuple[np.ndarray, ...]:
-        """`etid.signals.harmonics.filled` for `quiet` and numbers from `whole_periods`."""
-        if (periods, samples) not in self._spectra:
-            found = np.asarray(harmonics(self.quiet, periods, samples))
-            noise = self.noise_of_quiet(periods, samples)
-            power = np.array(noise.variance)
-            self._find_aliases(found, power, periods, samples)
-            for row, both in self._aliases.items():
-                if self.whole_periods[row] != (periods, samples):
-                    continue
-                spacing = self.spacing(row)
-                place = np.arange(1.0, power.shape[-1] + 1) * (periods / samples)
-                of_cause = np.interp(PLACES, place, power[row, 0])
-                of = weights(spacing, periods, of_cause, both[0])
-                found[row] = weighted(self.quiet[row, :, :samples], spacing, of)
-                power[row] *= np.interp(place, PLACES, periods * np.square(of).sum(-1))
-                rest = [left(of, spacing, aliases) for aliases in both]
-                power[row] += [np.interp(place, PLACES, one) for one in rest]
-            *fields, selected = filled(found, power, self.sample_rate, periods, samples)
-            usable = np.repeat(selected[None], len(self.recordings), axis=0)
-            of_ends = np.asarray(noise.of_ends).any(axis=1)
-            coarse = np.any(self.coarse, axis=1, keepdims=True)  # its quiet parts say little
-            usable[:, : power.shape[-1]] &= coarse | ~of_ends
-            self._spectra[periods, samples] = *map(np.asarray, fields), usable
-        return self._spectra[periods, samples]
+    def cut(self, which: int) -> Periods:
+        """The periods of `v_th` or of `v_out` in `quiet`, cut where the counted rate says."""
+        if which not in self._cuts:
+            at = self.counted_spacing[:, None] * np.arange(self.periods[0])
+            period = self.sample_rate / self.pulse_rate
+            self._cuts[which] = Periods.of(self.quiet[:, which], at, period)
+        return self._cuts[which]
 
-    def spacing(self, row: int) -> float:
-        """Length of a period [samples]; by the phases of its pulses if aliases need it."""
-        known = self.sample_rate / self.trains[row].counted
-        return self._exact.get(row, known)
-
-    def aliases(self, row: int) -> tuple[Aliases, Aliases] | None:
-        """Aliases of both records that differ between their periods; None if there are none."""
-        self.spectra(*self.whole_periods[row])
-        return self._aliases.get(row)
-
-    def _find_aliases(
-        self,
-        coefficients: Complex[np.ndarray, "recording 2 harmonic"],
-        power: Float[np.ndarray, "recording 2 harmonic"],
-        periods: int,
-        samples: int,
-    ) -> None:
-        """Find the aliases that leak into the harmonics, and the exact length of their periods."""
-        if periods < 3 or not separates_aliases(periods, samples) or self._cut > 0:
-            return
-        top = coefficients[:, 0, coefficients.shape[-1] * 9 // 10 :]  # aliases are as large there
-        loud = np.square(np.abs(top)).mean(-1) / power[:, 0, -top.shape[-1] :].mean(-1) - 1
-        middle = samples // periods  # a joint, where pulses must be at rest
+    @property
+    def _rests(self) -> Bool[np.ndarray, " recording"]:
+        """Whether the places are exact where the periods begin, and pulses are at rest there."""
+        if self._cut > 0 or self.periods[0] < 2:
+            return np.zeros(len(self.recordings), bool)
+        middle = self.periods[1] // self.periods[0]
         at = np.abs(self.quiet[:, :, middle] - self.quiet.mean(-1))
-        rests = (at < 0.1 * np.ptp(self.limits, axis=-1)).all(-1)
-        surely = SURE / math.sqrt(top.shape[-1])
-        for row in np.flatnonzero(rests & (loud > surely)).tolist():
-            if self.trains[row].spacing is None or self.whole_periods[row] != (periods, samples):
-                continue
-            v, known = self.quiet[row, :, :samples], self.spacing(row)
-            of_cause = Periods.of(v[0], known, periods)
-            spacing = known + of_cause.longer()
-            of_cause = of_cause._replace(spacing=spacing)
-            if abs(spacing - known) * periods > MOVED:
-                self._exact[row] = spacing
-            # At most, aliases are as large as the signal where they meet it.
-            kept = np.square(np.abs(of_cause.turns.mean(1))).sum()
-            if 2 * COHERENT * spacing * loud[row] * kept < LEAK:
-                continue
-            found = of_cause.aliases(power[row, 0])
-            if found is None:
-                continue
-            plain = np.full((PLACES.size, periods), 1 / periods)
-            place = np.arange(1.0, power.shape[-1] + 1) * (periods / samples)
-            of_noise = np.interp(PLACES, place, power[row, 0])
-            if (left(plain, spacing, found) > LEAK * of_noise).any():
-                other = Periods.of(v[1], spacing, periods).aliases(power[row, 1], found)
-                self._aliases[row] = found, other or found
-                self._exact[row] = spacing
+        trained = [train.spacing is not None for train in self.trains]
+        return np.array(trained) & (at < 0.1 * np.ptp(self.limits, axis=-1)).all(-1)
+
+    @property
+    def spectra(self) -> tuple[np.ndarray, ...]:
+        """`etid.signals.harmonics.filled` of `quiet`."""
+        return self._spectra[0]
+
+    @property
+    def differing(self) -> Differing:
+        """The aliases that differ between the periods."""
+        return self._spectra[1]
+
+    @functools.cached_property
+    def begins(self) -> Float[np.ndarray, "recording period"]:
+        """Start of each period of `v_th` [samples]."""
+        return self.differing.spacing[:, None] * np.arange(self.periods[0])
+
+    @functools.cached_property
+    @quietly()
+    def _spectra(self) -> tuple[tuple[np.ndarray, ...], Differing]:
+        periods, samples = self.periods
+        found = np.asarray(harmonics(self.quiet, periods, samples))
+        noise = self.noise_of_quiet
+        power = np.array(noise.variance)
+        differing = differing_aliases(
+            found, power, self.periods, self.counted_spacing, self._rests, self.cut
+        )
+        place = np.arange(1.0, power.shape[-1] + 1) * (periods / samples)
+        for row in np.flatnonzero(differing.rows):
+            both, spacing = (
+                (differing.of_cause.take(row), differing.of_out.take(row)),
+                differing.spacing[row],
+            )
+            of = weights(spacing, periods, np.interp(PLACES, place, power[row, 0]), both[0])
+            found[row] = weighted(self.quiet[row, :, :samples], spacing, of)
+            power[row] *= np.interp(place, PLACES, periods * np.square(of).sum(-1))
+            power[row] += [np.interp(place, PLACES, left(of, spacing, one)) for one in both]
+        *fields, selected = filled(found, power, self.sample_rate, periods, samples)
+        usable = np.repeat(selected[None], len(self.recordings), axis=0)
+        of_ends = np.asarray(noise.of_ends).any(axis=1)
+        coarse = np.any(self.coarse, axis=1, keepdims=True)  # its quiet parts say little
+        usable[:, : power.shape[-1]] &= coarse | ~of_ends
+        return (*map(np.asarray, fields), usable), differing
+
+
+def together(recordings: Sequence[Recording]) -> list[tuple[Group, list[int]]]:
+    """Groups of recordings with equal lengths and rates, and the places of their recordings."""
+    every = Group(recordings)
+    size, rate = every.whole.shape[2], every.sample_rate
+    keys = [(one.mismatch != "", whole_periods(size, rate, one.counted)) for one in every.trains]
+    alike = list(_alike(keys).values())
+    return [(every if len(alike) == 1 else every.part(rows), rows) for rows in alike]
+
+
+def _too_short(group: Group, rows: _Rows) -> _Holds:
+    shortest = max(SHORTEST, rise_time(group.sample_rate) + 1)
+    return np.full(rows.size, group.whole.shape[2] < shortest)
+
+
+def _saturated(group: Group, rows: _Rows) -> _Holds:
+    nothing = math.nan, math.nan
+    ranges = [group.recordings[row].adc_range or nothing for row in rows]
+    adc_range = np.repeat(np.array(ranges)[:, None], 2, axis=1)
+    if group.has_current:
+        adc_range[:, 0] = nothing  # it is one of volts
+    records, limits = _part(group.whole, rows), group.recorded_limits[rows]
+    sigma, step = group.noise[rows], group.step[rows]
+    found = faults.saturated(records, limits, step, adc_range)
+    if group.has_current:
+        found[:, 0] &= ~faults.held(sigma[:, 0], step[:, 0], group.spans[rows, 0])
+        return found.any(1)  # a stimulator that holds its voltage is no fault
+    unit = np.maximum(np.maximum(sigma, step), group.coarse[rows])[:, 1]
+    of = limits[:, 1], unit, group.lags[rows], group.sample_rate
+    return found.any(1) | faults.limited(records, *of)
+
+
+def _implausible(group: Group, rows: _Rows) -> _Holds:
+    found = [group.has_current and not faults.is_plausible(*group.spans[row, ::-1]) for row in rows]
+    return np.array(found, bool)
+
+
+def _unconnected(group: Group, rows: _Rows) -> _Holds:
+    if group.has_current:
+        return np.zeros(rows.size, bool)
+    of = group.covariance[rows], group.noise[rows], group.lags[rows]
+    return faults.unconnected(_part(group.quiet, rows), *of)
+
+
+def _misaligned(group: Group, rows: _Rows) -> _Holds:
+    hopeless = [kept is None and found is not None for kept, found in group._periods]
+    of_th, of_both, of_out = (group.covariance[rows, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    wrong = np.array(hopeless, bool)[rows]
+    if group.has_current:
+        return np.asarray(wrong | (of_both <= 0))  # a passive load takes power
+    return np.asarray(wrong | (of_out > 1.01 * of_th) | np.isnan(group.lags[rows]))
+
+
+_VERDICTS = {
+    "too_short": _too_short,
+    "nonfinite_samples": lambda group, rows: (
+        ~(np.isfinite(group.limits[rows]).all((1, 2)) & np.isfinite(group.spans[rows]).all(1))
+    ),
+    "flat": lambda group, rows: group.flat[rows].any(1),
+    "saturated": _saturated,
+    "wrong_unit": _implausible,
+    "unconnected": _unconnected,
+    "rate_mismatch": lambda group, rows: group.mismatch | group.clocks_differ[rows],
+    "misaligned": _misaligned,
+}
 
 
 def _records(recording: Recording) -> tuple[Samples, Samples]:
@@ -363,7 +448,7 @@ def _alike(keys: Sequence[_Key]) -> dict[_Key, list[int]]:
 
 
 def _part(
-    records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int]
+    records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int] | _Rows
 ) -> Float[np.ndarray, "row 2 time"]:
     """The rows of `records`; no copy if these are all."""
     return records if len(rows) == len(records) else records[np.asarray(rows)]
@@ -371,73 +456,3 @@ def _part(
 
 def _limits(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*record limit"]:
     return np.stack([v.min(-1), v.max(-1)], axis=-1)
-
-
-@quietly()
-def covariance_of(v: Float[np.ndarray, "*recording 2 time"]) -> Float[np.ndarray, "*recording 2 2"]:
-    """Covariance of both voltages of each recording."""
-    mean, square = v.mean(-1), np.zeros((*v.shape[:-1], 2))
-    for first in range(0, v.shape[-1], 8192):  # longer products start BLAS threads
-        part = v[..., first : first + 8192]
-        square += np.vecdot(part[..., :, None, :], part[..., None, :, :])
-    return square / v.shape[-1] - mean[..., :, None] * mean[..., None, :]
-
-
-def is_periodic(
-    records: Float[np.ndarray, "*recording 2 time"],
-    sigma: Float[np.ndarray, "*recording 2"],
-    rest: Float[np.ndarray, "*recording"],
-    samples: int,
-) -> Bool[np.ndarray, "*recording"]:
-    """Whether whole periods have no step from their end to their start.
-
-    Their length differs by `rest` from `samples`, up to half a sample. This makes a step if the
-    signal is steep at the joint.
-    """
-    joint = np.concatenate([records[..., samples - SEAM : samples], records[..., :SEAM]], axis=-1)
-    step = rest[..., None] * np.abs(np.diff(joint)).max(-1)
-    return np.asarray(~(step > BY_CHANCE * sigma).any(-1))
-
-
-def _repeats(
-    records: Float[np.ndarray, "2 time"],
-    sigma: Float[np.ndarray, "2"],
-    spacing: float,
-    samples: int,
-) -> bool:
-    """Whether a record that begins on an edge has the same edge at the end of all its periods.
-
-    If the clock of the pulses jitters, the end of the record does not continue at its start.
-    """
-    ends = np.arange(1, round(samples / spacing)) * spacing
-    cuts = np.rint(ends).astype(int)
-    around = np.concatenate([np.arange(samples - SEAM, samples), np.arange(SEAM)])
-    inside = records[:, cuts[:, None] + np.arange(-SEAM, SEAM)]
-    difference = np.abs(inside - records[:, None, around]).max(-1)
-    step = np.abs(np.diff(inside)).max(-1)  # of a jitter of one sample
-    # The samples beside a cut say within 0.2 samples what lies between samples.
-    allowed = (np.abs(cuts - ends) + 0.2) * step + BY_CHANCE * sigma[:, None]
-    return bool((difference <= allowed).all())
-
-
-def _kept(
-    records: Float[np.ndarray, "2 time"],
-    sigma: Float[np.ndarray, "2"],
-    bad: Bool[np.ndarray, " period"],
-    spacing: float,
-    sample_rate: float,
-) -> tuple[Joint | None, Shifts | None]:
-    """The plan to leave disturbed periods out and to align shifted ones, and their shifts.
-
-    Fewer than half of the periods may be left out: the others must show the shape of an undisturbed
-    period.
-    """
-    rise = rise_time(sample_rate)
-    if not enough(bad) or (bad.any() and any(of_source(v, bad, spacing, rise) for v in records)):
-        bad = np.zeros_like(bad)
-    found = shifts(records, sigma, spacing, bad.size, rise)
-    late = np.zeros(bad.size, int) if found is None else found.late
-    bad = bad if found is None else bad | found.bad
-    if not (bad.any() or late.any()) or not enough(bad):
-        return None, found
-    return joint(~bad, late, spacing, records.shape[1]), found

@@ -32,9 +32,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from etid.recordings.group import Group
 from etid.recordings.preflight import Inspected
+from etid.recordings.recording import quietly
 from etid.signals.harmonics import aliases
-from etid.signals.pulse_train import RATE, fast_length
+from etid.signals.periods import Periods, length_of, turns
+from etid.signals.pulse_train import fast_length
 
 # Relative to the sample rate. Below it, bands share one estimate of their noise. Above it, aliases
 # can exceed the noise; each band then has its own.
@@ -106,7 +109,7 @@ def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
     1.08. The polynomials have a degree of 6, which describes 0.994 of the 0.83 turns of 50 Hz hum.
     The measured pulse rate may differ from the nominal one.
     """
-    length = int((1 - RATE) * sample_rate / pulse_rate)
+    length = length_of(sample_rate / pulse_rate)
     size = fast_length(length)
     count = int(band * size)
     edges, ratio = [*range(min(12, count))], 1.08
@@ -123,35 +126,36 @@ def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
     return Bands(length, size, edges, number, middle, polynomials)
 
 
+@quietly()
 def repeats(inspected: Sequence[Inspected]) -> list[Repeats | None]:
     """Deviations of the periods of each recording.
 
     The result is None for a recording with fewer than two periods or with a coarse converter: the
     rounding errors of a coarse converter differ between the periods and are not noise.
 
-    The computation uses single precision: the noise of a record is a hundred times its rounding
-    errors. Recordings with the same number of periods are processed together, in a third of the
-    time.
+    Recordings that were inspected together are processed together. The computation uses single
+    precision: the noise of a record is a hundred times its rounding errors.
 
     Skin that changes during the record looks like hum between the harmonics. If the periods still
     differ after the subtraction of hum, hum was not the reason. Then the periods are compared as
     they were recorded.
     """
     deviations: list[Repeats | None] = [None] * len(inspected)
-    alike: dict[tuple, list[int]] = {}
+    alike: dict[int, list[int]] = {}
     for number, one in enumerate(inspected):
         if one.periods[0] > 1 and one.is_periodic and not one.coarse.any():
-            recording = one.recording
-            key = one.has_current, one.periods[0], recording.sample_rate, recording.pulse_rate
-            alike.setdefault(key, []).append(number)
+            alike.setdefault(id(one.used), []).append(number)
     for numbers in alike.values():
-        group = [inspected[number] for number in numbers]
-        of_group = _of_equal_periods(group, [one.quiet for one in group])
-        for row, one in enumerate(group):
-            if one.hums and _differ(of_group[row]):
-                (of_group[row],) = _of_equal_periods([one], [one.recorded])
-        for number, of_one in zip(numbers, of_group, strict=True):
-            deviations[number] = of_one
+        group = inspected[numbers[0]].used
+        rows = np.array([inspected[number].place for number in numbers])
+        late = np.array([inspected[number].lag for number in numbers])
+        found = _of_rows(group, rows, late, group.quiet)
+        for place, number in enumerate(numbers):
+            one = Repeats(*(field[place] for field in found))
+            if inspected[number].hums and _differ(one):
+                again = _of_rows(group, rows[[place]], late[[place]], group.whole)
+                one = Repeats(*(field[0] for field in again))
+            deviations[number] = one
     return deviations
 
 
@@ -163,76 +167,135 @@ def _differ(of: Repeats) -> bool:
     return bool(square > freedom + SURE * math.sqrt(2 * freedom))
 
 
-def _of_equal_periods(
-    group: Sequence[Inspected], records: Sequence[Float[np.ndarray, "2 _"]]
-) -> list[Repeats]:
-    """Deviations of recordings with equal rates and numbers of periods, from these voltages."""
-    recording, (periods, _) = group[0].recording, group[0].periods
-    sample_rate, pulse_rate = recording.sample_rate, recording.pulse_rate
-    at = np.stack([one.begins for one in group])
-    layout = bands(sample_rate, pulse_rate, 0.4)
-    # Without this shift, a late record would be cut within its pulses.
-    loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
-    aliased = np.array([one.aliases is not None for one in group])
-    own = _deviations(loaded, at, layout, _noise(group, 1, layout), aliased)
-    if group[0].has_current:
-        currents = [current for current, _ in records]
-        other = _deviations(currents, at, layout, _noise(group, 0, layout), aliased)
-        return _of_currents(group, layout, own, other)
+class _Rows(NamedTuple):
+    """Some of the recordings of a group, with the same bands.
+
+    Attributes:
+        group: The group.
+        rows: The recordings.
+        at: Start of each of their periods [samples].
+        aliased: Whether their aliases are known.
+        layout: The bands.
+    """
+
+    group: Group
+    rows: Int[np.ndarray, " lane"]
+    at: Float[np.ndarray, "lane period"]
+    aliased: Bool[np.ndarray, " lane"]
+    layout: Bands
+
+    def in_bands(
+        self, values: Float[np.ndarray, "recording harmonic"]
+    ) -> Float[np.ndarray, "lane band"]:
+        """Values at the harmonics of each recording, at the centre of each band."""
+        frequency, rate = self.group.spectra[0], self.group.sample_rate
+        angle = frequency[: values.shape[1]] * (2 * np.pi / rate)
+        place = np.interp(self.layout.middle, angle, np.arange(angle.size))
+        below = np.minimum(place.astype(int), angle.size - 2)
+        low, high = (values[self.rows[:, None], at] for at in (below, below + 1))
+        return low + (place - below) * (high - low)
+
+    def noise(self, record: int) -> Float[np.ndarray, "lane band"]:
+        """Variance of the real part of a harmonic of one period, of one of the records."""
+        variance = self.in_bands(np.asarray(self.group.noise_of_quiet.variance)[:, record])
+        return variance * (self.group.periods[1] * self.layout.length / 2)
+
+    def aliases(self) -> Bool[np.ndarray, "lane band"]:
+        """Bands whose aliases may exceed the noise.
+
+        Those above `ALIASES`, and those where what continues V_out beyond is too large. Aliases of
+        the n harmonics of a band add up, noise does not.
+        """
+        high = np.repeat(self.layout.middle[None] > 2 * np.pi * ALIASES, self.rows.size, axis=0)
+        if self.group.has_current:
+            return high
+        variance = np.asarray(self.group.noise_of_quiet.variance)[:, 1]
+        y = self.group.spectra[2][:, : variance.shape[1]]
+        ratio = np.asarray(aliases(y, variance, *self.group.periods).power / variance)
+        return high | (self.in_bands(ratio) * self.layout.number > 0.1)
+
+    def deviations(
+        self,
+        records: Float[np.ndarray, "recording 2 time"],
+        which: int,
+        late: Int[np.ndarray, " lane"],
+    ) -> "_Deviations":
+        """Deviations of the periods of one of the records, which may be late [samples]."""
+        group = self.group
+        if records is group.quiet:
+            found = group.cut(which).take(self.rows)
+        else:
+            found = self._cut(records[self.rows, which], self.at)
+        for lane in np.flatnonzero(late):
+            # Else a late record would be cut within its pulses. The samples cut off at one end are
+            # added at the other.
+            v = np.roll(records[self.rows[lane], which, : group.periods[1]], -late[lane])
+            own = self._cut(v[None], self.at[[lane]])
+            found.each[lane], found.starts[lane] = own.each[0], own.starts[0]
+        raw = found.each[..., 1 : self.layout.polynomials.shape[1] + 1].astype(np.complex64)
+        after = found.starts - self.at
+        return _deviations(raw, after, self.layout, self.noise(which), self.aliased)
+
+    def _cut(
+        self, v: Float[np.ndarray, "lane time"], at: Float[np.ndarray, "lane period"]
+    ) -> Periods:
+        return Periods.of(v, at, self.group.sample_rate / self.group.pulse_rate)
+
+
+def _of_rows(
+    group: Group,
+    rows: Int[np.ndarray, " lane"],
+    late: Int[np.ndarray, " lane"],
+    records: Float[np.ndarray, "recording 2 time"],
+) -> Repeats:
+    """Deviations of some recordings of a group, from these voltages; `v_out` may be late."""
+    rates = group.sample_rate, group.pulse_rate
+    of = _Rows(group, rows, group.begins[rows], group.differing.rows[rows], bands(*rates, 0.4))
+    own = of.deviations(records, 1, late)
+    if group.has_current:
+        return _of_currents(of, own, of.deviations(records, 0, 0 * late))
     # Of V_th only the amplitude is wanted. If some of the samples were left out, the aliases of its
     # edges would look like another amplitude in each period: by 1e-3 if every fourth remains.
-    low = bands(sample_rate, pulse_rate, 1 / 32)
-    v_th = [v_th for v_th, _ in records]
-    unloaded = _deviations(v_th, at, low, _noise(group, 0, low), aliased)
-    weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low)
+    low = of._replace(layout=bands(*rates, 1 / 32))
+    unloaded = low.deviations(records, 0, 0 * late)
+    weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low.layout)
     # Effect of an amplitude change by 1 after the projection of the polynomials.
     unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power
     total = (weight * _power(unit)).sum(1)
     along = np.real(unloaded.gain * (weight * np.conj(unit))[:, None, :]).sum(2)
-    amplitude, smooth = along / total[:, None], _smooth(own.mean, layout)
+    amplitude = along / total[:, None]
     # Coloured noise does not look like an amplitude change: the rest measures its size.
     rest = unloaded.gain - amplitude[:, :, None] * unit[:, None, :]
-    freedom = (2 * low.middle.size - 1) * (periods - 1)
+    periods = group.periods[0]
+    freedom = (2 * low.layout.middle.size - 1) * (periods - 1)
     noise = np.maximum(1.0, (weight[:, None, :] * _power(rest)).sum((1, 2)) / freedom)
-    pulses = zip(group, records, strict=True)
-    width = [_phase(v, *one.limits[0]) / periods for one, (v, _) in pulses]
+    width = _phases(records[rows, 0], group.limits[rows, 0]) / periods
     # Because cuts fall between samples, the amplitude differs by 1e-4 for 133 samples of a pulse,
     # by 0.03 for 8 samples.
     variance = noise / total + (2 / np.square(width)) ** 2
-    turn, removed = _directions(own.late, group, layout)
-    parts = own.gain, own.power, smooth, own.variance, turn, removed, amplitude, variance
-    return _rows(sample_rate, layout, parts)
-
-
-def _rows(sample_rate: float, layout: Bands, parts: tuple[np.ndarray, ...]) -> list[Repeats]:
-    """The rows of the fields after `sample_rate`."""
-    frequency = layout.middle * (sample_rate / (2 * np.pi))
-    rate = np.asarray(sample_rate)
-    return [Repeats(frequency, rate, *of_row) for of_row in zip(*parts, strict=True)]
+    return _joined(of, own, _smooth(own.mean, of.layout), amplitude, variance)
 
 
 def _directions(
-    late: Float[np.ndarray, "lane period"], group: Sequence[Inspected], layout: Bands
+    of: _Rows, late: Float[np.ndarray, "lane period"]
 ) -> tuple[
     Complex[np.ndarray, "lane direction period"],
     Complex[np.ndarray, "lane band direction direction"],
 ]:
     """`Repeats.turn` and `Repeats.removed` for cuts with these delays [samples]."""
     turns, basis = _rotations(late)
-    count = basis.shape[2]
-    removed = np.zeros((len(group), layout.middle.size, count, count), complex)
-    for row, one in enumerate(group):
-        if one.aliases is None:
-            basis[row, :, 1:] = 0
-            removed[row, :, 0, 0] = _aliased(one, layout) & basis[row].any()
-            continue
+    count, layout, known = basis.shape[2], of.layout, of.aliased
+    basis[~known, :, 1:] = 0
+    removed = np.zeros((len(late), layout.middle.size, count, count), complex)
+    removed[:, :, 0, 0] = of.aliases() & np.any(basis, axis=(1, 2), keepdims=True)[:, 0]
+    if known.any():
         place = layout.middle / (2 * np.pi)
-        y = one.aliases[1].at(place)[:2]
-        noise = _in_bands(one, layout, np.asarray(one.noise.variance[1]))
-        ratio = np.repeat(y * layout.number / (len(late[row]) * noise), 2, axis=0)
-        inside = basis[row].conj().T @ turns[row]
-        of_aliases = np.einsum("ak,kb,ck->bac", inside, ratio, inside.conj())
-        removed[row] = np.eye(count) - np.linalg.inv(np.eye(count) + of_aliases)
+        y = of.group.differing.of_out.take(of.rows[known]).at(place)[:, :2]
+        noise = of.in_bands(np.asarray(of.group.noise_of_quiet.variance)[:, 1])[known]
+        ratio = np.repeat(y * layout.number / (late.shape[1] * noise)[:, None], 2, axis=1)
+        inside = basis[known].conj().swapaxes(1, 2) @ turns[known]
+        of_aliases = np.einsum("rak,rkb,rck->rbac", inside, ratio, inside.conj())
+        removed[known] = np.eye(count) - np.linalg.inv(np.eye(count) + of_aliases)
     return basis.swapaxes(1, 2), removed
 
 
@@ -250,17 +313,16 @@ def _rotations(
     return turns, np.where((size > ALIGNED)[:, None], basis, 0)
 
 
-def _of_currents(
-    group: Sequence[Inspected], layout: Bands, own: "_Deviations", other: "_Deviations"
-) -> list[Repeats]:
+def _of_currents(of: _Rows, own: "_Deviations", other: "_Deviations") -> Repeats:
     """Deviations of the quotients of voltage and current."""
-    pairs = []
-    clock = _turns(own.late * (2 * np.pi / layout.size), own.raw.shape[2])  # one for both
-    for of in (own, other):
-        unit = np.sqrt(of.power.sum(1))  # squares of small currents would underflow
-        turned = of.raw * clock
+    pairs, layout = [], of.layout
+    angle = own.late * (2 * np.pi / layout.size)
+    clock = turns(angle, 1, own.raw.shape[2] + 1).astype(np.complex64)  # one for both
+    for one in (own, other):
+        unit = np.sqrt(one.power.sum(1))  # squares of small currents would underflow
+        turned = one.raw * clock
         turned = turned / unit[:, None, None]
-        noise = np.repeat(of.variance * of.power / unit[:, None] ** 2, layout.number, axis=1)
+        noise = np.repeat(one.variance * one.power / unit[:, None] ** 2, layout.number, axis=1)
         pairs.append((turned, turned.mean(1), noise))
     (y, y_mean, y_noise), (x, x_mean, x_noise) = pairs
     white = 1 / np.sqrt(_power(x_mean) * y_noise + _power(y_mean) * x_noise)
@@ -277,63 +339,41 @@ def _of_currents(
         gain.append(np.add.reduceat(rest * mean[row].conj(), layout.edges, axis=1) / power[row])
         smooth.append(np.add.reduceat(mean[row].conj() * basis, layout.edges, axis=1))
     none = np.zeros(own.late.shape)  # an amplitude that changes in both records does no harm
-    turn, removed = _directions(own.late, group, layout)
-    parts = np.stack(gain), power, np.stack(smooth), 1 / power, turn, removed
-    rate = group[0].recording.sample_rate
-    return _rows(rate, layout, (*parts, none, np.ones(len(none))))
+    found = own._replace(gain=np.stack(gain), power=power, variance=1 / power)
+    return _joined(of, found, np.stack(smooth), none, np.ones(len(none)))
 
 
-def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
+def _joined(
+    of: _Rows,
+    own: "_Deviations",
+    smooth: Complex[np.ndarray, "lane polynomial band"],
+    unloaded: Float[np.ndarray, "lane period"],
+    unloaded_variance: Float[np.ndarray, " lane"],
+) -> Repeats:
+    """The result, with the directions of the aliases."""
+    turn, removed = _directions(of, own.late)
+    count, rate = len(of.rows), of.group.sample_rate
+    frequency = np.repeat(of.layout.middle[None] * (rate / (2 * np.pi)), count, axis=0)
+    parts = own.gain, own.power, smooth, own.variance, turn, removed
+    return Repeats(frequency, np.full(count, rate), *parts, unloaded, unloaded_variance)
+
+
+def _phases(
+    v: Float[np.ndarray, "lane time"], limits: Float[np.ndarray, "lane limit"]
+) -> Int[np.ndarray, " lane"]:
     """Number of samples in all pulses; of biphasic pulses, those in the shorter phase."""
-    half = max(-low, high) / 2
-    above = int(np.count_nonzero(v > half)) if high > half else 0
-    below = int(np.count_nonzero(v < -half)) if low < -half else 0
-    return min(above, below) or max(above, below)
+    low, high = limits.T
+    half = np.maximum(-low, high)[:, None] / 2
+    above = np.where(high > half[:, 0], np.count_nonzero(v > half, axis=1), 0)
+    below = np.where(low < -half[:, 0], np.count_nonzero(v < -half, axis=1), 0)
+    shorter = np.minimum(above, below)
+    return np.where(shorter > 0, shorter, np.maximum(above, below))
 
 
 def _smooth(mean: np.ndarray, layout: Bands) -> np.ndarray:
     """Σ conj(Y) times each polynomial, for each recording and band."""
     products = np.conj(mean)[:, None, :] * layout.polynomials
     return np.add.reduceat(products, layout.edges, axis=2)
-
-
-def _turned(v_out: Float[np.ndarray, " time"], of: Inspected) -> Float[np.ndarray, " time"]:
-    """Loaded voltage without its lag; the samples cut off at one end are added at the other."""
-    return np.roll(v_out[: of.periods[1]], -of.lag) if of.lag else v_out
-
-
-def _aliased(one: Inspected, layout: Bands) -> Bool[np.ndarray, " band"]:
-    """Bands whose aliases may exceed the noise.
-
-    Those above `ALIASES`, and those where what continues V_out beyond is too large. Aliases of the
-    n harmonics of a band add up, noise does not.
-    """
-    high = layout.middle > 2 * np.pi * ALIASES
-    if one.has_current:
-        return high
-    variance = np.asarray(one.noise.variance[1])
-    y = one.spectrum[2][: variance.size]
-    ratio = np.asarray(aliases(y, variance, *one.periods).power / variance)
-    return high | (_in_bands(one, layout, ratio) * layout.number > 0.1)
-
-
-def _noise(
-    group: Sequence[Inspected], record: int, layout: Bands
-) -> Float[np.ndarray, "lane band"]:
-    """Variance of the real part of a harmonic of one period, in each band of one of the records."""
-    found = []
-    for one in group:
-        variance = _in_bands(one, layout, np.asarray(one.noise.variance[record]))
-        found.append(variance * one.periods[1] * (layout.length / 2))
-    return np.stack(found)
-
-
-def _in_bands(
-    one: Inspected, layout: Bands, values: Float[np.ndarray, " harmonic"]
-) -> Float[np.ndarray, " band"]:
-    """Values at the harmonics of a recording, at the centre of each band."""
-    angle = one.spectrum[0] * (2 * np.pi / one.recording.sample_rate)
-    return np.interp(layout.middle, angle[: values.size], values)
 
 
 class _Deviations(NamedTuple):
@@ -348,21 +388,23 @@ class _Deviations(NamedTuple):
 
 
 def _deviations(
-    records: Sequence[Float[np.ndarray, "_"]],
-    at: Float[np.ndarray, "lane period"],
+    raw: Complex[np.ndarray, "lane period harmonic"],
+    late: Float[np.ndarray, "lane period"],
     layout: Bands,
     least: Float[np.ndarray, "lane band"],
     aliased: Bool[np.ndarray, " lane"],
 ) -> "_Deviations":
-    """Deviations of the periods with the starts `at` [samples] and at least this `_noise`.
+    """Deviations of periods, and at least this noise.
 
-    The starts are exact for records whose aliases are known (`aliased`).
+    Args:
+        raw: Transforms of the periods.
+        late: By how much each of them is cut late [samples]; exact for records whose aliases are
+            known (`aliased`).
+        layout: The bands.
+        least: `_Rows.noise`.
+        aliased: Records whose aliases are known.
     """
-    periods = at.shape[1]
-    last = np.array([v.size - layout.length for v in records])
-    starts = np.minimum(np.rint(at), last[:, None]).astype(int)  # samples at which periods are cut
-    late = starts - at
-    raw = _transforms(records, starts, layout)
+    periods = raw.shape[1]
     power, mean, weight, gain = _compared(raw, late, layout)
     line = np.arange(periods) - (periods - 1) / 2
     line /= np.linalg.norm(line)
@@ -426,25 +468,6 @@ def _power(values: np.ndarray) -> np.ndarray:
     return np.real(values) ** 2 + np.imag(values) ** 2
 
 
-def _transforms(
-    records: Sequence[Float[np.ndarray, "_"]], starts: Int[np.ndarray, "lane period"], layout: Bands
-) -> np.ndarray:
-    """Harmonics of each period, without the line from its first sample to its last.
-
-    The line is that of the mean over the periods. A phase cannot rotate the ends of a period that
-    are not 0: in a pulse or on its tail, cuts beside their place would look like a change.
-    """
-    # Single precision suffices, and the products with polynomials are faster.
-    cut = np.zeros((*starts.shape, layout.size), np.float32)
-    used = cut[..., : layout.length]  # the zeros after it make the transform fast
-    for v, own, places in zip(records, used, starts.tolist(), strict=True):
-        for period, start in zip(own, places, strict=True):
-            period[:] = v[start : start + layout.length]
-    first, last = used[..., [0, -1]].mean(1).T[..., None]
-    used -= (first + (last - first) * np.linspace(0, 1, layout.length))[:, None]
-    return np.fft.rfft(cut)[:, :, 1 : layout.polynomials.shape[1] + 1]
-
-
 def _compared(
     raw: np.ndarray,
     late: Float[np.ndarray, "lane period"],
@@ -457,7 +480,8 @@ def _compared(
     """
     # Most recordings of a batch are cut alike.
     alike = late[:1] if (late == late[0]).all() else late
-    deviation = raw * _turns(alike * (2 * np.pi / layout.size), raw.shape[2])
+    turn_back = turns(alike * (2 * np.pi / layout.size), 1, raw.shape[2] + 1)
+    deviation = raw * turn_back.astype(np.complex64)
     mean = np.einsum("lpk->lk", deviation) / raw.shape[1]  # faster than `mean`
     deviation -= mean[:, None, :]
     if turn is not None:
@@ -470,15 +494,6 @@ def _compared(
     deviation *= np.conj(mean)[:, None, :]
     sums = np.add.reduceat(deviation, layout.edges, axis=2)
     return square[:, ::2] + square[:, 1::2], mean, weight, sums / weight[:, None, :]
-
-
-def _turns(angle: Float[np.ndarray, "lane period"], count: int) -> np.ndarray:
-    """e^(−j k angle) for k = 1 … `count`, as products of a few exponentials for speed."""
-    step = 1 << ((count - 1).bit_length() + 1) // 2
-    fine = np.exp(-1j * angle[..., None] * np.arange(1, step + 1)).astype(np.complex64)
-    coarse = np.exp(-1j * angle[..., None] * np.arange(0, count, step)).astype(np.complex64)
-    product = coarse[..., :, None] * fine[..., None, :]
-    return product.reshape(*angle.shape, -1)[..., :count]
 
 
 def _without(deviation: np.ndarray, polynomials: np.ndarray) -> np.ndarray:

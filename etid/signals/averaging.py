@@ -22,13 +22,16 @@ determine a spectrum S f^(−p), which is continued.
 """
 
 import itertools
-from typing import NamedTuple
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 
-from etid.signals.harmonics import COHERENT, flat, harmonics_of
-from etid.signals.pulse_train import PHASES, fast_length
+from etid.signals.harmonics import COHERENT, flat, harmonics_of, separates_aliases
+from etid.signals.periods import Periods
+from etid.signals.pulse_train import PHASES
 
 SEAM = 4  # samples on each side of the joint between two periods
 PLACES = np.linspace(0.0, 0.5, 6)  # of the sample rate, where weights are found
@@ -36,136 +39,203 @@ PAIRS = np.arange(1, 3)  # multiples k of the sample rate whose aliases count
 # Parts of the band, relative to the sample rate, that show aliases.
 UPPER, LOWER = (0.4, 0.5), (0.1, 0.35)
 FALLS = np.linspace(2.0, 30.0, 57)  # from that of edges to that behind a filter
-SURE = 4.0  # [standard errors] of a power that is not by chance
+LEAK = 0.1  # part of the noise that aliases on a harmonic may have
+MOVED = 0.05  # [samples] of the last period, from which on its place matters
+SURE = 4.0  # [standard errors] of a power, or of a length, that is not by chance
 CLEAR = 40.0  # [standard errors] of about half the noise, which is itself known to 3 %
 TOLD = 0.1  # part of a delay that must be told from aliases
+# Mean powers of both parts of the band of a spectrum with a power of 1 at the sample rate.
+SHAPES = [((1 - np.linspace(*of, 16)) ** -FALLS[:, None]).mean(1) for of in (UPPER, LOWER)]
 
 
 class Aliases(NamedTuple):
-    """The spectrum of a record beyond half the sample rate, S u^(−p) at u times the sample rate.
+    """The spectra of records beyond half the sample rate, S u^(−p) at u times the sample rate.
 
     Attributes:
-        power: S, as the power of a coefficient.
+        power: S, as the power of a coefficient; 0 if there are none.
         fall: p up to the sample rate.
         beyond: p from there on.
     """
 
-    power: float
-    fall: float
-    beyond: float
+    power: Float[np.ndarray, "*record"]
+    fall: Float[np.ndarray, "*record"]
+    beyond: Float[np.ndarray, "*record"]
 
-    def at(self, place: Float[np.ndarray, " place"]) -> Float[np.ndarray, "pair place"]:
+    def at(self, place: Float[np.ndarray, " place"]) -> Float[np.ndarray, "*record pair place"]:
         """Power of the aliases of each of `PAIRS` at frequencies relative to the sample rate."""
         both = np.stack([PAIRS[:, None] - place, PAIRS[:, None] + place])
-        return self.power * (both ** -np.where(both < 1, self.fall, self.beyond)).sum(0)
+        power, fall, beyond = (np.asarray(of)[..., None, None, None] for of in self)
+        return (power * both ** -np.where(both < 1, fall, beyond)).sum(-3)
+
+    def take(self, rows: Any) -> "Aliases":
+        """Those of some of the records."""
+        return Aliases(*(of[rows] for of in (self.power, self.fall, self.beyond)))
 
 
-class Periods(NamedTuple):
-    """The transforms of the periods of a record.
+class Differing(NamedTuple):
+    """Aliases of both records that differ between their periods.
 
     Attributes:
-        of_each: Coefficients of each period, as it was cut.
-        place: Their frequencies, relative to the sample rate.
-        starts: Samples at which the periods are cut.
-        spacing: Length of a period [samples].
+        rows: Recordings that have them.
+        spacing: Length of a period of each record [samples]; by the phases of its pulses if
+            aliases need it.
+        of_cause: Aliases of the first record of each record.
+        of_out: Aliases of `v_out`.
     """
 
-    of_each: Complex[np.ndarray, "period place"]
-    place: Float[np.ndarray, " place"]
-    starts: Int[np.ndarray, " period"]
-    spacing: float
-
-    @classmethod
-    def of(cls, v: Float[np.ndarray, " time"], spacing: float, periods: int) -> "Periods":
-        """The periods of a record, whose length is `spacing` [samples]."""
-        length = int(spacing) - 1
-        starts = np.rint(np.arange(periods) * spacing).astype(int)
-        starts = np.minimum(starts, v.size - length)
-        cut = v[starts[:, None] + np.arange(length)]
-        first, last = cut[:, [0, -1]].mean(0)
-        cut = cut - first - (last - first) * np.linspace(0, 1, length)
-        size = fast_length(length)
-        place = np.arange(size // 2 + 1) / size
-        return cls(np.fft.rfft(cut, size) / spacing, place, starts, spacing)
-
-    @property
-    def turns(self) -> Complex[np.ndarray, "pair period"]:
-        """How the aliases of `PAIRS` are turned in each period."""
-        return _turns(self.spacing, len(self.starts))
-
-    def _part(
-        self, low: float, high: float
-    ) -> tuple[Complex[np.ndarray, "period place"], Float[np.ndarray, " place"]]:
-        """Coefficients of each period in a part of the band, as if it began at its place."""
-        inside = (self.place >= low) & (self.place < high)
-        late, place = self.starts - self.spacing * np.arange(len(self.starts)), self.place[inside]
-        return self.of_each[:, inside] * np.exp(-2j * np.pi * np.outer(late, place)), place
-
-    def longer(self) -> float:
-        """By how much a period is longer than was said [samples].
-
-        A longer period turns the phases of each period more. Aliases of the first pair do not
-        count, unless there are too few periods to tell them.
-        """
-        line = np.arange(len(self.starts)) - (len(self.starts) - 1) / 2
-        plain, turn = np.ones(line.size), self.turns[0]
-        apart = _without(line, plain, turn.real, turn.imag)
-        if apart @ apart < TOLD * (line @ line):
-            apart = line
-        of_each, place = self._part(*PHASES)
-        slope = -2j * np.pi * place * of_each.mean(0) * (apart @ line)
-        return float(np.vdot(slope, apart @ of_each).real / np.vdot(slope, slope).real)
-
-    def aliases(
-        self, noise: Float[np.ndarray, " harmonic"], like: Aliases | None = None
-    ) -> Aliases | None:
-        """The aliases, from the differences between the periods; None if there are none.
-
-        Args:
-            noise: Power of the noise in each harmonic of the mean over the periods.
-            like: Aliases of the other record, which fall alike beyond the sample rate, and below
-                it, too, if the lower part of the band does not tell.
-        """
-        (power, lower), errors = np.transpose([self._beside(noise, of) for of in (UPPER, LOWER)])
-        # Mean powers of both parts of the band of a spectrum with a power of 1 at the sample rate.
-        shapes = [((1 - np.linspace(*of, 16)) ** -FALLS[:, None]).mean(1) for of in (UPPER, LOWER)]
-        if like is not None and lower < CLEAR * errors[1]:
-            fall = like.fall
-        elif like is not None or power > SURE * errors[0]:
-            ratio = np.log(max(power, errors[0]) / max(lower, errors[1]))
-            fall = float(np.interp(ratio, np.log(shapes[0] / shapes[1]), FALLS))
-        else:
-            return None
-        power = max(float(power / np.interp(fall, FALLS, shapes[0])), 0.0)
-        return Aliases(power, fall, fall if like is None else like.fall)
-
-    def _beside(
-        self, noise: Float[np.ndarray, " harmonic"], part: tuple[float, float]
-    ) -> tuple[float, float]:
-        """Mean power of the aliases in a part of the band, and its standard error."""
-        count, inside = len(self.of_each), np.var(self._part(*part)[0], axis=0)
-        begin, end = (int(2 * of * noise.size) for of in part)
-        of_noise = (count - 1) * noise[begin:end].mean()
-        seen = 1 - abs(self.turns[0].mean()) ** 2  # the mean holds the rest
-        error = of_noise / seen / np.sqrt(inside.size * (count - 1))
-        return float((inside.mean() - of_noise) / seen), float(error)
+    rows: Bool[np.ndarray, " record"]
+    spacing: Float[np.ndarray, " record"]
+    of_cause: Aliases
+    of_out: Aliases
 
 
-def _turns(spacing: float, periods: int) -> Complex[np.ndarray, "pair period"]:
-    return np.exp(2j * np.pi * spacing * np.outer(PAIRS, np.arange(periods)))
+def longer(
+    of: Periods, spacing: Float[np.ndarray, " record"]
+) -> tuple[Float[np.ndarray, " record"], Float[np.ndarray, " record"]]:
+    """By how much the periods of records are longer than `spacing` [samples], and standard errors.
+
+    A longer period turns the phases of each period more. Aliases of the first pair do not count,
+    unless there are too few periods to tell them.
+    """
+    periods = of.starts.shape[1]
+    line = np.arange(periods) - (periods - 1) / 2
+    known, like = np.unique(spacing, return_inverse=True)
+    turn = _turns(known, periods)[:, 0]
+    others = np.stack([np.ones(turn.shape), np.real(turn), np.imag(turn)], axis=-1)
+    apart = line - (others @ np.linalg.pinv(others, rcond=1e-6)) @ line
+    told = np.vecdot(apart, apart) >= TOLD * (line @ line)
+    apart = np.where(told[:, None], apart, line)[like]
+    each, place = of.turned(spacing, *PHASES)
+    slope = -2j * np.pi * place * each.mean(1) * (apart @ line)[:, None]
+    moved, power = np.einsum("rp,rpk->rk", apart, each), np.vecdot(slope, slope).real
+    found = np.vecdot(slope, moved).real / power
+    rest = moved - found[:, None] * slope
+    return found, np.sqrt(np.vecdot(rest, rest).real / (2 * place.size * power))
 
 
-def _without(
-    line: Float[np.ndarray, " period"], *others: Float[np.ndarray, " period"]
-) -> Float[np.ndarray, " period"]:
-    """A vector without what others can make."""
-    columns = np.array(others).T
-    return line - columns @ np.linalg.lstsq(columns, line, rcond=1e-6)[0]
+def exact_spacing(
+    of: Periods, spacing: Float[np.ndarray, " record"]
+) -> Float[np.ndarray, " record"]:
+    """`spacing`, or what the phases of the pulses say if the last one is surely elsewhere."""
+    by, error = longer(of, spacing)
+    last = of.starts.shape[1] - 1
+    differs = last * np.abs(by) > np.maximum(SURE * last * error, MOVED)
+    return np.where(differs, spacing + by, spacing)
+
+
+def aliases_of(
+    of: Periods,
+    spacing: Float[np.ndarray, " record"],
+    noise: Float[np.ndarray, "record harmonic"],
+    like: Aliases | None = None,
+) -> Aliases:
+    """The aliases of records, from the differences between their periods.
+
+    Args:
+        of: The periods.
+        spacing: Length of a period of each record [samples].
+        noise: Power of the noise in each harmonic of the mean over the periods.
+        like: Aliases of the other record, which fall alike beyond the sample rate, and below it,
+            too, if the lower part of the band does not tell.
+    """
+    power, of_upper = _beside(of, spacing, noise, UPPER)
+    lower, of_lower = _beside(of, spacing, noise, LOWER)
+    ratio = np.log(np.maximum(power, of_upper) / np.maximum(lower, of_lower))
+    fall = np.interp(ratio, np.log(SHAPES[0] / SHAPES[1]), FALLS)
+    if like is None:
+        power = np.where(power > SURE * of_upper, power, 0.0)
+    else:
+        fall = np.where(lower < CLEAR * of_lower, like.fall, fall)
+    power = np.maximum(power / np.interp(fall, FALLS, SHAPES[0]), 0.0)
+    return Aliases(power, fall, fall if like is None else like.fall)
+
+
+def differing_aliases(
+    coefficients: Complex[np.ndarray, "record 2 harmonic"],
+    power: Float[np.ndarray, "record 2 harmonic"],
+    periods: tuple[int, int],
+    spacing: Float[np.ndarray, " record"],
+    rests: Bool[np.ndarray, " record"],
+    cut: Callable[[int], Periods],
+) -> Differing:
+    """Aliases that leak into the harmonics, and the exact length of the periods.
+
+    Args:
+        coefficients: `harmonics` of both records.
+        power: Power of their noise.
+        periods: Numbers of periods and of samples, from `whole_periods`.
+        spacing: Length of a period, from the measured pulse rate [samples].
+        rests: Records of pulses that are at rest at the joints.
+        cut: The periods of the first or of the second record.
+    """
+    (count, samples), spacing = periods, spacing.copy()
+    none = [Aliases(*np.zeros((3, spacing.size))) for _ in range(2)]
+    found = Differing(np.zeros(spacing.size, bool), spacing, *none)
+    if count < 3 or not separates_aliases(*periods):
+        return found
+    top = coefficients[:, 0, coefficients.shape[-1] * 9 // 10 :]  # aliases are as large there
+    loud = np.square(np.abs(top)).mean(-1) / power[:, 0, -top.shape[-1] :].mean(-1) - 1
+    rows = np.flatnonzero(rests & (loud > SURE / math.sqrt(top.shape[-1])))
+    if not rows.size:
+        return found
+    of_cause, known = cut(0).take(rows), spacing[rows]
+    exact = known + longer(of_cause, known)[0]
+    moved = np.abs(exact - known) * count > MOVED
+    spacing[rows[moved]] = exact[moved]
+    # At most, aliases are as large as the signal where they meet it.
+    held = np.square(np.abs(_turns(exact, count).mean(-1))).sum(-1)
+    leaks = 2 * COHERENT * exact * loud[rows] * held >= LEAK
+    rows, exact, of_cause = rows[leaks], exact[leaks], of_cause.take(leaks)
+    if not rows.size:
+        return found
+    own = aliases_of(of_cause, exact, power[rows, 0])
+    place = np.arange(1.0, power.shape[-1] + 1) * (count / samples)
+    of_noise = np.array([np.interp(PLACES, place, one) for one in power[rows, 0]])
+    plain = np.full((PLACES.size, count), 1 / count)
+    leaks = (left(plain, exact, own) > LEAK * of_noise).any(-1)
+    rows, exact, own = rows[leaks], exact[leaks], own.take(leaks)
+    if not rows.size:
+        return found
+    other = aliases_of(cut(1).take(rows), exact, power[rows, 1], own)
+    found.rows[rows], spacing[rows] = True, exact
+    for whole, part in ((found.of_cause, own), (found.of_out, other)):
+        for field, of_rows in zip(whole, part, strict=True):
+            field[rows] = of_rows
+    return found
+
+
+def _beside(
+    of: Periods,
+    spacing: Float[np.ndarray, " record"],
+    noise: Float[np.ndarray, "record harmonic"],
+    part: tuple[float, float],
+) -> tuple[Float[np.ndarray, " record"], Float[np.ndarray, " record"]]:
+    """Mean power of the aliases in a part of the band, and its standard error."""
+    each, place = of.turned(spacing, *part)
+    count = each.shape[1]
+    each = (each - each.mean(1, keepdims=True)).view(float)
+    inside = np.einsum("rpk,rpk->r", each, each) / (count * place.size * spacing**2)
+    begin, end = (int(2 * at * noise.shape[1]) for at in part)
+    of_noise = (count - 1) * noise[:, begin:end].mean(1)
+    seen = 1 - np.abs(_turns(spacing, count)[:, 0].mean(1)) ** 2  # the mean holds the rest
+    error = of_noise / seen / np.sqrt(place.size * (count - 1))
+    return (inside - of_noise) / seen, error
+
+
+def _turns(
+    spacing: Float[np.ndarray, "*record"] | float, periods: int
+) -> Complex[np.ndarray, "*record pair period"]:
+    """How the aliases of `PAIRS` are turned in each period."""
+    turn = np.asarray(spacing)[..., None, None]
+    return np.exp(2j * np.pi * turn * np.outer(PAIRS, np.arange(periods)))
 
 
 def weights(
-    spacing: float, periods: int, noise: Float[np.ndarray, " place"], aliases: Aliases
-) -> Float[np.ndarray, "place period"]:
+    spacing: Float[np.ndarray, "*record"] | float,
+    periods: int,
+    noise: Float[np.ndarray, "*record place"],
+    aliases: Aliases,
+) -> Float[np.ndarray, "*record place period"]:
     """The weights of the periods with the least error, at each of `PLACES`.
 
     Args:
@@ -175,19 +245,23 @@ def weights(
         aliases: The aliases.
     """
     turns = _turns(spacing, periods)
-    of_pairs = np.real(turns[:, :, None] * turns[:, None, :].conj())
-    errors = np.einsum("kp,kij->pij", COHERENT * spacing * aliases.at(PLACES), of_pairs)
-    errors += (periods * noise)[:, None, None] * np.eye(periods)
-    found = np.linalg.solve(errors, np.ones((noise.size, periods, 1)))[..., 0]
+    of_pairs = np.real(turns[..., :, None] * turns[..., None, :].conj())
+    power = COHERENT * np.asarray(spacing)[..., None, None] * aliases.at(PLACES)
+    errors = np.einsum("...kp,...kij->...pij", power, of_pairs)
+    errors += (periods * noise)[..., None, None] * np.eye(periods)
+    found = np.linalg.solve(errors, np.ones((periods, 1)))[..., 0]
     return found / found.sum(-1, keepdims=True)
 
 
 def left(
-    of: Float[np.ndarray, "place period"], spacing: float, aliases: Aliases
-) -> Float[np.ndarray, " place"]:
+    of: Float[np.ndarray, "*#record place period"],
+    spacing: Float[np.ndarray, "*record"] | float,
+    aliases: Aliases,
+) -> Float[np.ndarray, "*record place"]:
     """Power of the aliases that a mean with these weights holds, as of independent errors."""
-    kept = np.square(np.abs(of @ _turns(spacing, of.shape[1]).T))
-    return COHERENT * spacing * (aliases.at(PLACES).T * kept).sum(-1)
+    turns = _turns(spacing, of.shape[-1]).swapaxes(-1, -2)
+    held = aliases.at(PLACES).swapaxes(-1, -2) * np.square(np.abs(of @ turns))
+    return COHERENT * np.asarray(spacing)[..., None] * held.sum(-1)
 
 
 def weighted(

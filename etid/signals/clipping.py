@@ -23,6 +23,17 @@ from numpy.polynomial import legendre
 from etid.signals.white_noise import noise_std
 
 
+def may_be_clipped(
+    v: Float[np.ndarray, "*record time"], limits: Float[np.ndarray, "*record limit"]
+) -> Bool[np.ndarray, "*record"]:
+    """Whether three samples in a row are at the smallest or at the largest sample of a record."""
+    found = np.zeros(v.shape[:-1], bool)
+    for extreme in np.moveaxis(limits, -1, 0):
+        at = v == extreme[..., None]
+        found |= (at[..., :-2] & at[..., 1:-1] & at[..., 2:]).any(-1)
+    return found
+
+
 def is_clipped(v: Float[np.ndarray, " time"], step: float) -> bool:
     """Whether many samples in a row are at a rail."""
     rails = [extreme for extreme in (v.min(), v.max()) if _has_run(v == extreme)]
@@ -53,6 +64,24 @@ MOVED = 12.0  # of the same unit, by the droop of V_th; noise moves a top of 16 
 EDGE = 2  # samples at both ends of a top, within the edges
 
 
+def may_be_limited(
+    v: Float[np.ndarray, "record time"],
+    limits: Float[np.ndarray, "record limit"],
+    unit: Float[np.ndarray, " record"],
+    sample_rate: float,
+) -> Bool[np.ndarray, " record"]:
+    """Whether records have enough samples at an extreme value for `is_limited`."""
+    band = BAND * unit
+    low, high = (limits[:, 0] + band)[:, None], (limits[:, 1] - band)[:, None]
+    count = np.maximum(np.count_nonzero(v >= high, axis=1), np.count_nonzero(v <= low, axis=1))
+    return count >= shortest(sample_rate)
+
+
+def shortest(sample_rate: float) -> float:
+    """Samples of the shortest flat top."""
+    return max(SHORTEST[0] * sample_rate, float(SHORTEST[1]))
+
+
 def is_limited(
     cause: Float[np.ndarray, " time"],
     v: Float[np.ndarray, " time"],
@@ -71,19 +100,19 @@ def is_limited(
         unit: Standard deviation of its noise, or its converter step if this is larger.
         sample_rate: Sampling rate [Hz].
     """
-    shortest = max(SHORTEST[0] * sample_rate, SHORTEST[1])
+    least = shortest(sample_rate)
     for sign, at in (
         (1.0, v >= v.max() - BAND * unit),
         (-1.0, v <= v.min() + BAND * unit),
     ):
-        if np.count_nonzero(at) < shortest:  # nearly all records
+        if np.count_nonzero(at) < least:  # nearly all records
             continue
         at &= sign * cause > 0.5 * (sign * cause).max()
         ends = np.flatnonzero(np.diff(at, prepend=False, append=False))
         tops = [
             slice(first + EDGE, last - EDGE)
             for first, last in ends.reshape(-1, 2)
-            if last - first - 2 * EDGE >= shortest
+            if last - first - 2 * EDGE >= least
         ]
         if tops:
             rise, shape = _shape(v, tops)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from etid.signals.pulse_train import highest, rises
+from etid.signals.pulse_train import highest, rise_time, rises
 from etid.signals.quick_looks import allowed_deviation, highest_beside, noise_limit, period_means
 
 STEEP = 0.3  # an edge rises by more than this part of the steepest rise of a pulse
@@ -215,3 +215,26 @@ def joint(
     before = (number - np.arange(number.size)) * spacing  # samples that are left out
     skipped = np.minimum(np.rint(before), size - ends[-1]).astype(int)
     return Joint(ends[:-1] + skipped, late, np.diff(ends), number * spacing - skipped)
+
+
+def kept(
+    records: Float[np.ndarray, "2 time"],
+    sigma: Float[np.ndarray, "2"],
+    bad: Bool[np.ndarray, " period"],
+    spacing: float,
+    sample_rate: float,
+) -> tuple[Joint | None, Shifts | None]:
+    """The plan to leave disturbed periods out and to align shifted ones, and their shifts.
+
+    Fewer than half of the periods may be left out: the others must show the shape of an undisturbed
+    period.
+    """
+    rise = rise_time(sample_rate)
+    if not enough(bad) or (bad.any() and any(of_source(v, bad, spacing, rise) for v in records)):
+        bad = np.zeros_like(bad)
+    found = shifts(records, sigma, spacing, bad.size, rise)
+    late = np.zeros(bad.size, int) if found is None else found.late
+    bad = bad if found is None else bad | found.bad
+    if not (bad.any() or late.any()) or not enough(bad):
+        return None, found
+    return joint(~bad, late, spacing, records.shape[1]), found

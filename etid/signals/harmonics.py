@@ -252,12 +252,12 @@ class Aliases(NamedTuple):
         harmonics: Number of harmonics with the same relative error, n.
     """
 
-    power: Float[Array | np.ndarray, " harmonic"]
-    fall: Float[Array | np.ndarray, ""]
+    power: Float[Array | np.ndarray, "*record harmonic"]
+    fall: Float[Array | np.ndarray, "*record"]
     harmonics: float
 
     @property
-    def variance(self) -> Float[Array | np.ndarray, " harmonic"]:
+    def variance(self) -> Float[Array | np.ndarray, "*record harmonic"]:
         """Variance of independent errors that stand for A [V²]."""
         return self.harmonics * self.power
 
@@ -276,21 +276,21 @@ class Aliases(NamedTuple):
 
 
 def aliases(
-    coefficients: Complex[Array | np.ndarray, " harmonic"],
-    variance: Float[Array | np.ndarray, " harmonic"],
+    coefficients: Complex[Array | np.ndarray, "*record harmonic"],
+    variance: Float[Array | np.ndarray, "*record harmonic"],
     periods: int,
     samples: int,
 ) -> Aliases:
-    """The aliases on the harmonics of a record."""
+    """The aliases on the harmonics of records."""
     xp = namespace(variance)
-    position = np.arange(1.0, variance.size + 1) * (periods / samples)
+    position = np.arange(1.0, variance.shape[-1] + 1) * (periods / samples)
     squares = xp.real(coefficients) ** 2 + xp.imag(coefficients) ** 2
     signals, errors = [], []
     for low, high in (LOWER, UPPER):
         inside = (position >= low) & (position < high)
         count = float(max(np.count_nonzero(inside), 1))
-        noise = xp.sum(xp.where(inside, variance, 0.0)) / count
-        signals.append(xp.sum(xp.where(inside, squares, 0.0)) / count - noise)
+        noise = xp.sum(xp.where(inside, variance, 0.0), axis=-1) / count
+        signals.append(xp.sum(xp.where(inside, squares, 0.0), axis=-1) / count - noise)
         errors.append(noise / np.sqrt(count))
     exceeds_noise = signals[1] > 3.0 * errors[1]
     falls = exceeds_noise & (signals[0] > signals[1])
@@ -300,7 +300,8 @@ def aliases(
     level = xp.where(exceeds_noise, signals[1], 0.0)
     # Padded harmonics lie above half the sample rate; they have no aliases.
     mirrored = np.maximum(1 - position, 0.5) / middle
-    return Aliases(level * mirrored**-fall, fall, COHERENT * samples / periods)
+    power = level[..., None] * mirrored ** -fall[..., None]
+    return Aliases(power, fall, COHERENT * samples / periods)
 
 
 def have_ended(

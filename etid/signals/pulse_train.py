@@ -7,6 +7,7 @@ the elements. This module uses NumPy only, because it runs before anything is fi
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -25,7 +26,6 @@ RATE = 2e-3  # relative error of pulse_rate; a larger one is a wrong number, not
 # Relative to the sample rate. Below the first, the drift of the mean is larger than a delay; above
 # the second, aliases are a twentieth of the signal.
 PHASES = 0.005, 0.05
-BY_ALIASES = 0.05  # [samples] delay of the last pulse that aliases may look like
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +47,7 @@ class PulseTrain:
     sample_rate: float
     pulse_rate: float
 
-    @property
+    @functools.cached_property
     def counted(self) -> float:
         """Pulse rate [Hz] as measured by the clock of the converter.
 
@@ -66,7 +66,7 @@ class PulseTrain:
             return self.pulse_rate
         return self.sample_rate / self.spacing
 
-    @property
+    @functools.cached_property
     def mismatch(self) -> str:
         """How the spacing of the pulses contradicts the rates; empty if it does not."""
         rate, pulse_rate = self.sample_rate, self.pulse_rate
@@ -249,44 +249,6 @@ def highest(correlation: Float[np.ndarray, "*record lag"]) -> Float[np.ndarray, 
     return np.asarray(top + beside)
 
 
-def exact_spacing(
-    v: Float[np.ndarray, "record time"], first: int, spacing: float, periods: int
-) -> Float[np.ndarray, " record"]:
-    """`spacing`, or what the phases of the first and the last pulse say if they surely differ."""
-    by, error = late(v, first, spacing, periods)
-    differs = np.abs(by) > np.maximum(SURE * error, BY_ALIASES)
-    return spacing + np.where(differs, by, 0.0) / max(periods - 1, 1)
-
-
-def late(
-    v: Float[np.ndarray, "record time"], first: int, spacing: float, periods: int
-) -> tuple[Float[np.ndarray, " record"], Float[np.ndarray, " record"]]:
-    """How much later the last pulse is than this spacing says [samples], and its standard error.
-
-    It is the slope of the phase between the transforms of the first and the last pulse.
-
-    Args:
-        v: Records.
-        first: An edge of their first pulse [samples].
-        spacing: Length of a period [samples].
-        periods: Number of whole periods.
-    """
-    size = fast_length(int(spacing / 4))
-    begin = max(first - size // 4, 0)
-    again = begin + round((periods - 1) * spacing)
-    if again + size > v.shape[1]:  # the last pulse is cut
-        return np.zeros(len(v)), np.full(len(v), np.inf)
-    turn = 2 * np.pi * np.arange(size // 2 + 1) / size
-    inside = (turn > 2 * np.pi * PHASES[0]) & (turn < 2 * np.pi * PHASES[1])
-    one, other = (np.fft.rfft(v[:, at : at + size])[:, inside] for at in (begin, again))
-    turn, product = turn[inside], np.conj(one) * other
-    phase = np.angle(product * np.exp(-1j * turn * (again - begin - (periods - 1) * spacing)))
-    weight = np.abs(product) * turn
-    total = weight @ turn
-    found = -np.vecdot(weight, phase) / total
-    return found, np.linalg.norm(weight * (phase + found[:, None] * turn), axis=1) / total
-
-
 # --- Drift of one record against the other --------------------------------------------------------
 
 
@@ -299,7 +261,7 @@ def clocks_apart(
     records: Float[np.ndarray, "recording 2 time"],
     sigma: Float[np.ndarray, "recording 2"],
     trains: Sequence[PulseTrain],
-    lags: Sequence[float | None],
+    lags: Float[np.ndarray, " recording"],
 ) -> Float[np.ndarray, " recording"]:
     """How far `v_out` drifts from `v_th` between the first and the last pulse [samples].
 
@@ -311,11 +273,11 @@ def clocks_apart(
         records: Unloaded and loaded voltage [V] of recordings with equal rates.
         sigma: Standard deviations of their noise [V].
         trains: The pulses of each `v_th`.
-        lags: Lags of `v_out` [samples], as `lags_of` finds them.
+        lags: Lags of `v_out` [samples], as `lags_of` finds them; NaN if they are not known.
     """
     apart, alike = np.zeros(len(records)), dict[tuple[bytes, int], list[int]]()
-    for row, (train, lag) in enumerate(zip(trains, lags, strict=True)):
-        if train.spacing is not None and lag is not None:
+    for row, (train, lag) in enumerate(zip(trains, lags.tolist(), strict=True)):
+        if train.spacing is not None and math.isfinite(lag):
             alike.setdefault((train.edges.tobytes(), round(lag)), []).append(row)
     for (_, late), rows in alike.items():
         apart[rows] = _drifts(records, sigma, rows, trains[rows[0]], late)
@@ -407,7 +369,7 @@ def _within_a_sample(
 
 def lags_of(
     records: Float[np.ndarray, "recording 2 time"], trains: Sequence[PulseTrain]
-) -> list[float | None]:
+) -> Float[np.ndarray, " recording"]:
     """Lag of `v_out` behind `v_th` of each recording, from the edges of one period.
 
     The load smooths the edges. The lag found is therefore up to one sample too large.
@@ -417,15 +379,15 @@ def lags_of(
         trains: The pulses of each `v_th`.
 
     Returns:
-        The lags [samples]; None if both records have opposite polarity, are more than 400 samples
+        The lags [samples]; NaN if both records have opposite polarity, are more than 400 samples
         or a quarter of a period apart, or are shorter than an edge.
     """
-    lags: list[float | None] = [None] * len(records)
+    lags = np.full(len(records), np.nan)
     if not trains or records.shape[2] <= rise_time(trains[0].sample_rate):
         return lags
     for window, rows in _windows(records[:, 0], trains).items():
-        for row, lag in zip(rows, _lags(records, rows, window), strict=True):
-            lags[row] = float(lag) if abs(lag) <= window.largest else None
+        found = _lags(records, rows, window)
+        lags[rows] = np.where(np.abs(found) <= window.largest, found, np.nan)
     return lags
 
 
