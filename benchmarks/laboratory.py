@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
+from etid.circuits.directions import At, simulated
 from etid.recordings.recording import Recording, Samples
 from etid.simulation.scenes import Electronics, Scene
 from etid.simulation.transformer import (
@@ -62,6 +63,7 @@ class Output:
     electronics: Electronics | None = None
     sampling_jitter: float = 0.0  # standard deviation of the time of every single sample [s]
     added: tuple[Added, ...] = ()  # voltages that are added at the converter
+    faults: tuple[tuple[str, float], ...] = ()  # of `DIRECTIONS`, and their sizes
     # coefficients of the terminal voltage by sampler, where the load is not linear
     voltage: Callable[[TransformerDriver, Sampler], Complex[np.ndarray, " f"]] | None = None
     # number of a sample that the recorder loses; all later ones are one early
@@ -80,7 +82,11 @@ class Output:
             found = self.voltage(self.driver, sampler)
         else:
             v_th, z_th = _thevenin(self.driver, sampler)
-            found = v_th * loading(np.asarray(load(sampler.f), complex), z_th)
+            if self.faults:
+                gain = simulated(At.behind(sampler.f, z_th, load), z_th, self.faults)
+            else:
+                gain = loading(np.asarray(load(sampler.f), complex), z_th)
+            found = v_th * gain
         if self.pulses:
             turns = np.outer(sampler.harmonics, [time / self.over for time, _ in self.pulses])
             found = found * (np.exp(-2j * np.pi * turns) @ [height for _, height in self.pulses])
@@ -289,11 +295,6 @@ def pink(rms: float) -> Added:
 def leaky(load: Impedance, r: float) -> Impedance:
     """A load with a resistor [ohm] across it."""
     return lambda f: load(f) * r / (load(f) + r)
-
-
-def inductive(load: Impedance, inductance: float) -> Impedance:
-    """A load with an inductor [H] in series."""
-    return lambda f: load(f) + 2j * np.pi * f * inductance
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ import scipy.stats
 from benchmarks import perturbed_study as lab
 from benchmarks import visibility
 from benchmarks.failure_axes import Cole, TwoLayers
-from benchmarks.laboratory import hum, inductive, leaky, offset, pink, spike
+from benchmarks.laboratory import hum, leaky, offset, pink, spike
 from benchmarks.ladder import ELECTRONICS, LOADS, WHITE
 from benchmarks.perturbed_study import Change, all_records, both, calibrations, out, th, trials
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
@@ -73,8 +73,8 @@ NUISANCES: Mapping[str, Change] = {
     "jump_1V_5ms_out": trials(out(added=(spike(1.0, 5e-3, rectangular=True),))),
     "tail_5mV_5ms": all_records(lab.tail(5e-3, 5e-3)),
     "tail_5mV_5ms_skin": trials(lab.tail(5e-3, 5e-3)),
-    "crosstalk_1%_neighbour": trials(lab.crosstalk(4e-3)),
-    "crosstalk_1%_unloaded": trials(lab.crosstalk(0.0)),
+    "crosstalk_1%_neighbour": trials(lab.neighbour(4e-3)),
+    "crosstalk_1%_unloaded": trials(lab.fault("crosstalk", 0.01)),
     "coloured_noise_1/f": all_records(lambda of: both(added=(pink(3 * of.sigma),))(of)),
 }
 
@@ -95,15 +95,15 @@ CONVERTERS: Mapping[str, Change] = {
     "out_a_tenth_skin_only": trials(out(gain=0.1)),
     "lowpass_80kHz_skin": trials(out(lowpass=80e3)),
     "lowpass_80kHz_skin_one_period": lab.lasting(3_400, trials(out(lowpass=80e3))),
-    "capacitance_5pF_skin": trials(lab.shunted(5e-12)),
+    "capacitance_5pF_skin": trials(lab.fault("capacitance", 5e-12)),
     "adc_jitter_500ns": all_records(both(sampling_jitter=500e-9)),
     "slow_adc_filter_out": all_records(out(lowpass=30e3)),
     "slow_adc_filter_out_skin_only": trials(out(lowpass=30e3)),
-    "gain_out_+1%_all": all_records(out(gain=1.01)),
-    "gain_out_-1%_all": all_records(out(gain=0.99)),
-    "gain_out_+1%_skin": trials(out(gain=1.01)),
-    "gain_out_-1%_skin": trials(out(gain=0.99)),
-    "gain_-5%_skin": trials(out(gain=0.95)),
+    "gain_out_+1%_all": all_records(lab.fault("gain", 0.01)),
+    "gain_out_-1%_all": all_records(lab.fault("gain", -0.01)),
+    "gain_out_+1%_skin": trials(lab.fault("gain", 0.01)),
+    "gain_out_-1%_skin": trials(lab.fault("gain", -0.01)),
+    "gain_-5%_skin": trials(lab.fault("gain", -0.05)),
     "polarity_out": all_records(out(gain=-1.0)),
     "polarity_out_skin_only": trials(out(gain=-1.0)),
     "polarity_both": all_records(both(gain=-1.0)),
@@ -169,7 +169,7 @@ SKINS: Mapping[str, Change] = {
     "cole_alpha0.8": lab.skin_is(functools.partial(Cole, alpha=0.8), words=True),
     "two_rc_mid": lab.skin_is(functools.partial(TwoLayers, share=0.3), words=True),
     "leak_100Rp": lab.skin_is(lambda skin: leaky(skin, 100 * skin.r_p)),
-    "inductance_5mH_skin": lab.skin_is(lambda skin: inductive(skin, 5e-3)),
+    "inductance_5mH_skin": trials(lab.fault("inductance", 5e-3)),
 }
 
 _ALL_PARTS = ("r_protection", "r_secondary", "l_secondary", "l_magnetising", "r_source")
@@ -246,17 +246,19 @@ INVISIBLE: Mapping[str, Invisible] = {
     # It has the impedance of another R_s + R_p ‖ C_p at every frequency; R_p is least.
     "leak_100Rp": Invisible(error=0.017),
     # R_p up to 13 %, and R_p of damp skin up to 6, 6 and 8 %.
-    **{f"gain_out_{sign}1%_all": Invisible(visibility.gain(0.01, True)) for sign in "+-"},
-    **{f"gain_out_{sign}1%_skin": Invisible(visibility.gain(0.01, False)) for sign in "+-"},
-    "crosstalk_1%_unloaded": Invisible(visibility.crosstalk(0.01)),
-    **{f"driver_Vp_{sign}2%_out_vs_th": Invisible(visibility.gain(0.02, False)) for sign in "+-"},
+    **{f"gain_out_{sign}1%_all": Invisible(visibility.fault("gain", 0.01, True)) for sign in "+-"},
+    **{f"gain_out_{sign}1%_skin": Invisible(visibility.fault("gain", 0.01)) for sign in "+-"},
+    "crosstalk_1%_unloaded": Invisible(visibility.fault("crosstalk", 0.01)),
+    **{f"driver_Vp_{sign}2%_out_vs_th": Invisible(visibility.fault("gain", 0.02)) for sign in "+-"},
     # R_s up to 80 and 40 %, of dry skin up to 6 %.
     "slow_adc_filter_out_skin_only": Invisible(visibility.lowpass(30e3)),
     "lowpass_80kHz_skin": Invisible(visibility.lowpass(80e3)),
     "lowpass_80kHz_skin_one_period": Invisible(visibility.lowpass(80e3)),
-    "capacitance_5pF_skin": Invisible(visibility.shunt(5e-12)),
-    "inductance_5mH_skin": Invisible(visibility.inductor(5e-3)),
+    "capacitance_5pF_skin": Invisible(visibility.fault("capacitance", 5e-12)),
+    "inductance_5mH_skin": Invisible(visibility.fault("inductance", 5e-3)),
     # R_p up to 4 %.
-    "driver_Rprot_x1.05": Invisible(visibility.series(0.05 * TransformerDriver().r_protection)),
+    "driver_Rprot_x1.05": Invisible(
+        visibility.fault("series", 0.05 * TransformerDriver().r_protection)
+    ),
 }
 """Perturbations that the records show too faintly, or not at all."""

@@ -142,7 +142,12 @@ def parts(*voltages: str, **factors: float) -> Callable[[Record], Record]:
     return change
 
 
-def crosstalk(later: float, part: float = 0.01) -> Callable[[Record], Record]:
+def fault(name: str, size: float) -> Callable[[Record], Record]:
+    """Let the loaded voltage have a fault of `DIRECTIONS`."""
+    return lambda of: out(faults=(*of.out.faults, (name, size)))(of)
+
+
+def neighbour(later: float, part: float = 0.01) -> Callable[[Record], Record]:
     """Let the loaded voltage see a part of an unloaded one whose pulse is later by so much [s]."""
 
     def change(of: Record) -> Record:
@@ -274,12 +279,3 @@ def tail(height: float, time_constant: float) -> Callable[[Record], Record]:
         return out(added=(exponential(SCALE * height, *times),))(of)
 
     return change
-
-
-def shunted(c: float) -> Callable[[Record], Record]:
-    """Put a capacitor [F] across every load."""
-
-    def across(load: Impedance) -> Impedance:
-        return lambda f: load(f) / (1 + 2j * np.pi * f * c * load(f))
-
-    return lambda of: out(loads=tuple(map(across, of.out.loads)))(of)

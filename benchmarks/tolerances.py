@@ -26,6 +26,8 @@ from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS, TRUTH
 from benchmarks.rates import rate
 from benchmarks.runner import WORKERS, Target, each, option, report
+from etid.circuits.directions import DIRECTIONS
+from etid.results.instrument import ERRORS
 
 SILENT = 4.0  # standard errors
 FIRST = 5000  # number of the first driver
@@ -42,11 +44,11 @@ KINDS = {**{name: (name,) for name in SIZES}, "all": tuple(SIZES)}
 MODES = ("behind a driver", JOINT)
 # What one tolerance changes; with a wrong resistor all impedances change in proportion, unseen.
 SEEN_BY_BEST = {
-    "gain": visibility.gain(SIZES["gain"], True),
-    "crosstalk": visibility.crosstalk(SIZES["crosstalk"], True),
-    "capacitance": visibility.shunt(SIZES["capacitance"]),
+    **{name: visibility.fault(name, SIZES[name], True) for name in ("gain", "crosstalk")},
+    "capacitance": visibility.fault("capacitance", SIZES["capacitance"]),
     "delay": None,
 }
+RECORDS = {"all": lab.all_records, "loads": lab.trials, "calibrations": lab.calibrations}
 
 OPTIONS = (
     WORKERS,
@@ -75,11 +77,9 @@ def study(
     drawn = {name: size * normal() for name, size in SIZES.items()}
     error = {name: of if name in names else 0.0 for name, of in drawn.items()}
     of = lab.undisturbed(number, snr_db)
-    of = lab.all_records(lab.out(gain=1 + error["gain"]))(of)
-    of = lab.all_records(lab.crosstalk(0.0, error["crosstalk"]))(of)
-    of = lab.trials(lab.shunted(error["capacitance"]))(of)
-    of = lab.calibrations(lab.shunted(abs(error["c_load"])))(of)  # no carrier has a negative one
-    of = lab.calibrations(lab.record(r_load=lab.REFERENCE / (1 + error["r_load"])))(of)
+    error["c_load"] = abs(error["c_load"])  # no carrier has a negative one
+    for name in ERRORS:
+        of = RECORDS[DIRECTIONS[name].records](lab.fault(name, error[name]))(of)
     if "drift" in names:  # of all parts, independently
         later = lab.drawn_driver(FIRST + number, SIZES["drift"], of.trials[0].out.driver)
         of = lab.trials(lab.both(driver=later))(of)

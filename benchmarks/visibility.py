@@ -23,8 +23,9 @@ from jaxtyping import Complex, Float
 
 from benchmarks.ladder import rung
 from etid.circuits.circuit import SkinRC
+from etid.circuits.directions import DIRECTIONS, At
 from etid.simulation.published import REFERENCE
-from etid.simulation.transformer import SkinLoad, loading
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 BAND = 0.4  # of the sample rate
 LIMIT = 3.0  # standard deviations; a test with this limit refuses one good recording of 370
@@ -33,53 +34,25 @@ RARE = 3.89  # one of 10 000, as a study can bear of a test that is asked of eve
 Gain = Complex[np.ndarray, " f"]
 
 
-class Records(NamedTuple):
-    """What both loaded records hold at the harmonics."""
+class Change(NamedTuple):
+    """A change of the gains of V_out."""
 
-    f: Float[np.ndarray, " f"]  # harmonics [Hz]
-    skin: Gain  # impedance of the skin [ohm]
-    z_th: Gain  # source impedance [ohm]
-    gains: tuple[Gain, Gain]  # V_out / V_th with the skin and with the resistor
+    of: Callable[[At], Gain]
+    calibration: bool  # whether the resistor's gain changes as well
 
-
-Change = Callable[[Records], tuple[Gain | float, Gain | float]]
-"""Changes of both gains, with the skin and with the resistor."""
+    def __call__(self, skin: At, resistor: At) -> tuple[Gain, Gain]:
+        """Changes with the skin and with the resistor."""
+        return self.of(skin), self.calibration * self.of(resistor)
 
 
-def gain(part: float, calibration: bool) -> Change:
-    """V_out larger by this part, with the resistor as well or not."""
-    return lambda of: (part * of.gains[0], part * calibration * of.gains[1])
-
-
-def crosstalk(part: float, calibration: bool = False) -> Change:
-    """V_out sees this part of V_th, with the resistor as well or not."""
-    return lambda of: (part, part * calibration)
+def fault(name: str, size: float, calibration: bool = False) -> Change:
+    """A fault of `DIRECTIONS`."""
+    return Change(lambda at: size * DIRECTIONS[name].change(at)[0, 0], calibration)
 
 
 def lowpass(corner: float) -> Change:
     """A filter of first order before V_out [Hz], with the skin only."""
-    return lambda of: (-of.gains[0] * np.log(1 + 1j * of.f / corner), 0.0)
-
-
-def series(r: float) -> Change:
-    """A resistor in series with the source [ohm], with the skin only."""
-    return lambda of: (-of.gains[0] * r / (of.skin + of.z_th), 0.0)
-
-
-def inductor(inductance: float) -> Change:
-    """An inductor in series with the load [H], with the skin only."""
-    return lambda of: (
-        of.gains[0] * 2j * np.pi * of.f * inductance * (1 - of.gains[0]) / of.skin,
-        0.0,
-    )
-
-
-def shunt(c: float) -> Change:
-    """A capacitor across the load [F], with the skin only."""
-    return lambda of: (
-        -of.gains[0] * 2j * np.pi * of.f * c * of.skin * of.z_th / (of.skin + of.z_th),
-        0.0,
-    )
+    return Change(lambda at: -at.gains[0] * np.log(1 + 1j * at.frequency / corner), False)
 
 
 def information(
@@ -98,9 +71,9 @@ def information(
     circuit, at = SkinRC(load.r_s, load.r_p, load.c_p), jnp.asarray(f)
     logs = circuit.log_values()
     slope = np.asarray(jax.jacfwd(lambda logs: circuit.with_log_values(logs).response(at))(logs))
-    loads = load(f), np.full(f.size, complex(REFERENCE))
-    gains = loading(loads[0], z_th), loading(loads[1], z_th)
-    changed = [change(Records(f, loads[0], z_th, gains)) for change in changes]
+    both = [At.behind(f, z_th, of) for of in (load, ResistorLoad(REFERENCE))]
+    loads, gains = [of.z for of in both], [of.gains[0] for of in both]
+    changed = [change(*both) for change in changes]
     # Rows: V_out with the skin and the resistor, then both V_th. Columns of b: Z_th, and each X.
     known = 7 if one_pulse else 5
     a = np.zeros((f.size, 4, known + len(changes)), complex)

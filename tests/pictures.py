@@ -38,7 +38,7 @@ from etid.plotting.layout import FINGERTIP
 from etid.report import figures, tables
 from etid.report.tables import Components
 from etid.results.driver import Calibration, ContinuousDriver, Driver, SourceImpedance
-from etid.results.fit import CHANGES, Fit, Support
+from etid.results.fit import Fit, Support
 from etid.results.fits import Fits
 from etid.results.verdicts import verdicts_of
 from etid.selection.search import usual_circuits
@@ -138,7 +138,7 @@ def selection(**verdicts: str) -> etid.Selection:
     found = {}
     for number, circuit, deviance in ((0, NEAREST, 2600.0), (3, SPREAD, 2000.0)):
         verdict = verdicts.get(type(circuit).__name__, "successful")
-        unseen = (np.zeros(of) for of in (CHANGES, (), len(circuit.names()), ()))
+        unseen = (np.zeros(of) for of in (Support.changes(), (), len(circuit.names()), ()))
         support = Support(np.array(deviance), np.array(2e3), *unseen)
         one = fit(verdict, circuit, 0.01)
         found[number] = dataclasses.replace(one, chi2=np.array(deviance / 2e3), support=support)

@@ -52,6 +52,9 @@ CASES = {
     "curves": ("--quick --folder {}", "curves.csv curves.svg", "LM fit, optimistix"),
     "delays": ("--scatter 3e-9 --snr-db 60", "", "3 ns: 64, 64, 82, dropped"),
     "design": ("", "", "times better than 60 Hz"),
+    "directions": (
+        "--drivers 2 --snr-db 60 --parts 0.03 --workers 1", "", "gain: deviation",
+    ),
     "driver_order": ("--drivers 1 --snr-db 60 --orders 5 7 --data {}", "", "100 % right"),
     "fuzz": ("--files 3 --kind csv --output {}/f.json", "f.json", "0 faults in 3 files"),
     "instruments": (

@@ -8,7 +8,7 @@ import scipy.stats
 
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
-from etid.estimators.score_tests import FALSE_ALARMS
+from etid.circuits.directions import FALSE_ALARMS
 from etid.identify import changes
 from etid.recordings.preflight import Inspected
 from etid.recordings.repeats import _noise_of_single, repeats

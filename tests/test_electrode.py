@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
-from etid.estimators.score_tests.other_circuit import MOVED, SPREAD
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online import alarms, tick
 from etid.online import state as states
-from etid.online.alarms import SEEN_IN_PULSES, PulseScores
+from etid.online.alarms import MOVED, SEEN_IN_PULSES, SPREAD, PulseScores
 from etid.online.gain_bands import Bands
 from etid.online.noise import Noise
 from etid.online.projection import Seen

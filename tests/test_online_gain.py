@@ -13,8 +13,7 @@ import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.online_alarms import LOADS, Fingertip
 from etid.estimators.judgement import MISFIT_CHI2
-from etid.estimators.score_tests.other_circuit import SPREAD
-from etid.online.alarms import SEEN_IN_PULSES
+from etid.online.alarms import SEEN_IN_PULSES, SPREAD
 from etid.online.pulse_fit import GainModel
 from etid.online.tracker import Tracker
 from etid.results.verdicts import verdict_names

@@ -13,13 +13,24 @@ import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import CALIBRATION, LOADS, rung
 from benchmarks.perturbed_study import all_records, out, undisturbed
-from etid.circuits.circuit import Resistor
+from etid.circuits import directions
+from etid.circuits.circuit import Resistor, impedance_at
+from etid.circuits.directions import DIRECTIONS, FALSE_ALARMS, At, scored
 from etid.estimators.sandwich import Linear
-from etid.estimators.score_tests import FALSE_ALARMS, SEEN, other_circuit
+from etid.estimators.score_tests import other_circuit
 from etid.estimators.score_tests.other_circuit import Score, Scores
 from etid.simulation.scenes import Trial
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
+
+def place(circuit, f):
+    """A load at some frequencies, of which its impedance is used only."""
+
+    def impedance(f):
+        return impedance_at(circuit, np.log(np.asarray(circuit.values())), f)
+
+    return At(f, impedance(f), impedance=impedance, exponents=bool(circuit.exponents()))
 
 
 def test_the_slope_is_that_of_a_constant_phase_and_of_the_asymmetry_of_one():
@@ -36,21 +47,21 @@ def test_the_slope_is_that_of_a_constant_phase_and_of_the_asymmetry_of_one():
         return 33e3 + 186e3 / (1 + (s * 22e-6) ** 0.85)
 
     for circuit, changed in ((skin, spread), (cole, skewed)):
-        z, (slope, *_) = other_circuit.changes(circuit.impedance(), jnp.asarray(f))
-        np.testing.assert_allclose(z, changed(0.0), rtol=1e-12)
+        at = place(circuit, f)
+        np.testing.assert_allclose(at.z, changed(0.0), rtol=1e-12)
         expected = (changed(step) - changed(-step)) / (2 * step)
-        np.testing.assert_allclose(slope, expected, rtol=1e-7)  # step², and rounding over step
+        # step², and rounding over step
+        np.testing.assert_allclose(directions.spread(at), expected, rtol=1e-7)
 
 
 def test_a_relaxation_becomes_a_layer_of_diffusion():
     r_p, tau, f = 1e5, 90e-6, np.geomspace(60.0, 1e6, 30)
-    whole = 8 / np.pi**2 * (1 + np.sum(1 / other_circuit.FASTER**2))  # without still faster ones
-    one = etid.ParallelRC(whole * r_p, 4 / np.pi**2 * tau / (whole * r_p))
-    change = other_circuit.layer(one.impedance(), jnp.asarray(f))
+    whole = 8 / np.pi**2 * (1 + np.sum(1 / directions.FASTER**2))  # without still faster ones
+    at = place(etid.ParallelRC(whole * r_p, 4 / np.pi**2 * tau / (whole * r_p)), f)
+    z, _ = DIRECTIONS["layer"].of_load(at, 1.0)
     root = np.sqrt(2j * np.pi * f * tau)
-    left = np.asarray(one.response(f)) + np.asarray(change) - r_p * np.tanh(root) / root
     assert whole > 0.96
-    assert np.max(np.abs(left)) < 1.01 * (1 - whole) * r_p
+    assert np.max(np.abs(z - r_p * np.tanh(root) / root)) < 1.01 * (1 - whole) * r_p
 
 
 def test_a_change_shows_unless_the_circuit_makes_it_or_an_element_would_be_negative():
@@ -59,7 +70,7 @@ def test_a_change_shows_unless_the_circuit_makes_it_or_an_element_would_be_negat
     slope = [(-0.9, 0.9, -9.0), (-1.1, 0.0, 0.0), (0.0, 1.1, 0.0), (9.0, -9.0, 9.0)]
     slope = jnp.array([*slope, (0.0, 0.0, 0.0), (-1.1, 0.0, 0.0)])
     powers = jnp.array([1.0, -1.0, 0.0])
-    found = jax.vmap(lambda of: of.would_show(powers))(Score(z, z, z, stderr, slope))
+    found = jax.vmap(lambda of: of.would_show(powers))(Score(z, z, z, stderr, slope, slope))
     np.testing.assert_allclose(found, [10.0, np.inf, np.inf, 10.0, 0.0, 0.0])
 
 
@@ -74,60 +85,50 @@ def scores(residual, rows, jacobian):
     return other_circuit.scores(jnp.asarray(rows), linear, jnp.asarray(residual), fitted)
 
 
-NUMBER = {"spread": 0, "relaxation": 3}
-LIMIT = {"spread": SEEN, "relaxation": other_circuit.SEEN_RELAXATION}
+COUNT = sum(DIRECTIONS[name].count for name in scored()) - 1  # no currents
+NUMBER = {"spread": 0, "relaxation": 3, "gain": 9, "capacitance": 11}
+CIRCUITS = ("spread", "relaxation")
 
 
 @pytest.mark.parametrize("change", NUMBER)
 def test_what_counts_is_the_residual_along_what_the_parameters_cannot_do(change):
-    rng = np.random.default_rng(4)
-    jacobian, rows = rng.normal(size=(3, 50)), rng.normal(size=(5, 50))
+    rng, limit = np.random.default_rng(4), DIRECTIONS[change].limit
+    jacobian, rows = rng.normal(size=(3, 50)), rng.normal(size=(COUNT, 50))
     rows += 0.1 * jacobian.sum(0)  # so that a change moves the elements
-    row = rows[NUMBER[change]]
-    rest = row - np.linalg.lstsq(jacobian.T, row, rcond=None)[0] @ jacobian
-    along = rest / np.linalg.norm(rest)
+    row, others = rows[NUMBER[change]], np.delete(rows, NUMBER[change], axis=0)
+    along = row - np.linalg.lstsq(jacobian.T, row, rcond=None)[0] @ jacobian
+    # Orthogonal to all other changes, each of which has a limit of its own.
+    every = np.concatenate([jacobian, others])
+    rest = row - np.linalg.lstsq(every.T, row, rcond=None)[0] @ every
     anything = rng.normal(size=3) @ jacobian  # a fit that has not quite ended
-    for z in (0.99 * LIMIT[change], 1.01 * LIMIT[change], -1.01 * LIMIT[change]):
-        found = scores(z * along + anything, rows, jacobian)
+    for z in (0.99 * limit, 1.01 * limit, -1.01 * limit):
+        residual = z * rest * np.linalg.norm(along) / (rest @ along)
+        found = scores(residual + anything, rows, jacobian)
         assert float(found.z[NUMBER[change]]) == pytest.approx(z)
-        assert bool(Scores.of(found).seen()) == (abs(z) > LIMIT[change])
-
-
-@pytest.mark.parametrize("z", [0.99, 1.01, 2.0, -2.0])
-def test_a_wrong_gain_is_no_relaxation(z):
-    """It has a limit of its own; it was tested as one more relaxation too."""
-    rng = np.random.default_rng(4)
-    jacobian, rows = rng.normal(size=(3, 50)), rng.normal(size=(5, 50))
-    rows[-1] += 0.1 * jacobian.sum(0)  # so that the gain moves the elements
-    others = np.concatenate([jacobian, rows[:-1]])
-    rest = rows[-1] - np.linalg.lstsq(others.T, rows[-1], rcond=None)[0] @ others
-    along = rows[-1] - np.linalg.lstsq(jacobian.T, rows[-1], rcond=None)[0] @ jacobian
-    residual = z * SEEN * rest * np.linalg.norm(along) / (rest @ along)
-    found = Scores.of(scores(residual, rows, jacobian))
-    assert float(found.gain.z) == pytest.approx(z * SEEN)
-    assert bool(found.has_other_gain()) == (abs(z) > 1)
-    assert not found.seen()
+        found = Scores.of(found, 0)
+        assert bool(found.misfit) == (abs(z) > limit)
+        assert bool(found.seen()) == (abs(z) > limit and change in CIRCUITS)
 
 
 @pytest.mark.parametrize("change", NUMBER)
 def test_a_change_that_hardly_matters_is_none(change):
     """However well it is determined: a driver that is not quite right looks like that."""
-    rng = np.random.default_rng(6)
-    jacobian, rows = 1e4 * rng.normal(size=(3, 50)), 1e4 * rng.normal(size=(5, 50))
+    rng, of = np.random.default_rng(6), DIRECTIONS[change]
+    jacobian, rows = 1e4 * rng.normal(size=(3, 50)), 1e4 * rng.normal(size=(COUNT, 50))
     row = rows[NUMBER[change]]
     others = np.linalg.lstsq(jacobian.T, row, rcond=None)[0]
-    size = {"spread": other_circuit.SPREAD, "relaxation": other_circuit.MOVED / max(abs(others))}
+    size = max(of.least, of.moves / max(abs(others)))
     alone = np.zeros_like(rows)
     alone[NUMBER[change]] = row
     for factor in (0.99, 1.01):
-        found = scores(factor * size[change] * row, alone, jacobian)
-        assert bool(Scores.of(found).seen()) == (factor > 1)
+        found = scores(factor * size * row, alone, jacobian)
+        assert bool(Scores.of(found, 0).misfit) == (factor > 1)
 
 
 def test_a_relaxation_that_the_circuit_has_is_none():
     """What is left of its direction is rounding, whose score would be any number."""
     f = np.geomspace(60.0, 1e5, 200)
-    tau = 1 / (2 * np.pi * np.geomspace(30.0, 2e5, other_circuit.GRID)[4])
+    tau = 1 / (2 * np.pi * np.geomspace(30.0, 2e5, directions.RELAXATIONS)[4])
     circuit = etid.SkinRC(33e3, 186e3, tau / 186e3)
 
     def real(z):
@@ -137,9 +138,11 @@ def test_a_relaxation_that_the_circuit_has_is_none():
         return real(circuit.with_log_values(log_values).impedance()(jnp.asarray(2j * np.pi * f)))
 
     jacobian = jax.jacfwd(impedance)(circuit.log_values()).T
-    rows = real(other_circuit.changes(circuit.impedance(), jnp.asarray(f))[1])
+    term = DIRECTIONS["relaxation"].term
+    assert term is not None
+    rows = real(jnp.asarray(term(place(circuit, f))))
     z = scores(np.random.default_rng(7).normal(size=400), rows, jacobian).z
-    np.testing.assert_array_equal(np.isnan(z), np.arange(z.size) == 5)
+    np.testing.assert_array_equal(np.isnan(z), np.arange(z.size) == 4)
 
 
 def identified(load, snr_db, circuit):
@@ -197,8 +200,8 @@ def test_a_wrong_gain_is_seen_where_it_moves_r_p_by_a_quarter():
 def test_a_gain_that_is_likely_goes_into_the_errors_and_one_that_is_proven_does_not(z, likely):
     """With an error of 2 %, as large as gains are expected, the mean is half of the estimate."""
     stderr, slope = 0.02, np.array([3.0, -2.0])
-    score = Score(*map(jnp.asarray, (z, z * stderr, 3 * abs(z) * stderr, stderr, slope)))
-    found, cov = Scores(score, score, score).doubt()
+    numbers = (z,), (z * stderr,), (3 * abs(z) * stderr,), (stderr,), slope[None], slope[None]
+    found, cov = Scores({"gain": Score(*map(jnp.asarray, numbers))}).doubt()
     assert bool(found) is likely
     expected = np.outer(slope, slope) * (z * stderr / 2) ** 2 if likely else np.zeros((2, 2))
     np.testing.assert_allclose(cov, expected, rtol=1e-12)
@@ -226,13 +229,13 @@ def test_a_gain_in_all_records_that_no_test_proves_is_in_the_errors(snr_db, gain
 @pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [30.0, 40.0, 50.0, 60.0])
 def test_good_recordings_are_refused_as_rarely_as_a_study_can_bear(snr_db):
-    """Of 2000 with drawn drivers; six tests of 1 in 10 000 refuse 1.2 of them.
+    """Of 2000 with drawn drivers; seven tests of 1 in 10 000 refuse 1.4 of them.
 
     More than seven have a probability of 4e-5. With a limit of three standard deviations for the
     gain, 3 of 7200 recordings at 40 to 50 dB were refused, and 14 of 6664 of another draw. At 24 dB
     other reasons are more frequent: one driver of ten is unclear.
     """
-    tests, drivers, seeds = 6, 10, 100
+    tests, drivers, seeds = 7, 10, 100
     verdicts = []
     for number in range(drivers):
         study = undisturbed(number, snr_db)

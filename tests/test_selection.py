@@ -13,7 +13,7 @@ from benchmarks.perturbed_study import PARTS, drawn_driver, undisturbed
 from benchmarks.selection_draws import TRUTHS, draws, errors, quantities
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
-from etid.results.fit import CHANGES, Fit, Support
+from etid.results.fit import Fit, Support
 from etid.results.verdicts import verdict
 from etid.selection.common import common
 from etid.selection.evidence import best, bic, rank, weights, with_close
@@ -47,15 +47,26 @@ SCENE = Scene(
 )
 
 
+def scores(z):
+    """Scores of all changes, which begin like this."""
+    return np.append(z, np.zeros(Support.changes() - len(z)))
+
+
 def made(
-    circuit, deviance, name="successful", z=(0.0,) * CHANGES, error=0.01, slope=0.0, shows=50.0
+    circuit,
+    deviance,
+    name="successful",
+    z=(),
+    error=0.01,
+    slope=0.0,
+    shows=50.0,
 ):
     """A fit of these elements, with relative standard errors `error`.
 
     A spread has the standard error 0.1; an element has the logarithmic slope `slope`. A layer of
     diffusion would show `shows` standard deviations.
     """
-    size = len(circuit.names())
+    size, z = len(circuit.names()), scores(z)
     unseen = np.asarray(0.1), np.full(size, slope), np.asarray(shows)
     cov = np.diag((error * np.asarray(circuit.values())) ** 2)
     return Fit(
@@ -229,17 +240,19 @@ def test_weak_evidence_of_many_recordings_decides_and_that_of_one_does_not():
 @pytest.mark.parametrize(
     ("z", "words"),
     [
-        # Cole's circuit fitted by one relaxation: the largest score is a negative relaxation.
+        # Cole's circuit fitted by one relaxation: a spread is several relaxations.
         ((19.0, 0.0, 0.0, 0.0, 6.0, 3.0, -12.0, -23.0, -1.0), "a spread of time constants"),
-        ((0.0, 8.0, *[0.0] * 7), "a slow tail"),
-        ((0.0, *[0.0] * 6, 8.0, 0.0), "one more fast relaxation"),
+        ((0.0, -8.0, *[0.0] * 7), "a slow tail"),
+        ((0.0, *[0.0] * 6, -8.0, 0.0), "one more fast relaxation"),
+        ((3.0, *[0.0] * 5, -40.0, -29.0, -24.0), "one more fast relaxation"),
+        ((0.0, 8.0, *[0.0] * 6, -1.0), ""),  # a negative relaxation is not passive,
         ((*[0.0] * 8, -5.0), "another gain of v_out"),
         ((*[2.9] * 9,), ""),
     ],
 )
 def test_a_residual_looks_like_what_a_passive_circuit_can_make(z, words):
     nothing = np.zeros(())
-    said = Support(nothing, nothing, np.array(z), nothing, np.zeros(3), nothing).looks_like()
+    said = Support(nothing, nothing, scores(z), nothing, np.zeros(3), nothing).looks_like()
     assert words in said
     assert bool(said) == bool(words)
 

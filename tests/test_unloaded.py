@@ -10,8 +10,8 @@ import pytest
 import scipy.stats
 
 import etid
+from etid.circuits.directions import FALSE_ALARMS
 from etid.estimators.lanes import Harmonics
-from etid.estimators.score_tests import FALSE_ALARMS
 from etid.estimators.score_tests.unloaded import SEEN, UnloadedShape, shape
 from etid.recordings.preflight import Inspected
 from etid.recordings.study import Study

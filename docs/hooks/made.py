@@ -1,7 +1,7 @@
 """Parts of pages that are made from the code: `<!-- made: NAME -->` in a page.
 
-The tables of verdicts and remarks come from their messages, the command line from its parsers, and
-the reference from the names that `etid` exports.
+The tables of verdicts and remarks come from their messages, the tests from the table of directions,
+the command line from its parsers, and the reference from the names that `etid` exports.
 """
 
 import os
@@ -12,6 +12,7 @@ import optimistix as optx
 
 import etid
 from etid import cli
+from etid.circuits import directions
 from etid.recordings import remarks
 from etid.results import verdicts
 
@@ -41,6 +42,17 @@ def table_of_remarks():
     """Table of all remarks and their sentences."""
     rows = [f"| `{one.name}` | {remarks.texts(one)[0]} |" for one in remarks.Remark]
     return "\n".join(["| remark | what it says |", "|---|---|", *rows])
+
+
+def table_of_tests():
+    """Table of the changes for which a fit tests, with their limits."""
+    rows = []
+    for of in directions.DIRECTIONS.values():
+        least = f"ε of {of.least:g}" if of.least else f"{100 * of.moves:g} % of an element"
+        for looks in dict.fromkeys(of.looks) if of.verdict else ():
+            rows.append(f"| {looks} | {of.limit:.2g} | {least} | `{of.verdict}` |")
+    heads = "| the residual looks like | limit of \\|z\\| | and at least | verdict |"
+    return "\n".join([heads, "|---|---|---|---|", *rows])
 
 
 def commands():
@@ -89,6 +101,7 @@ def _package(named):
 MADE = {
     "verdicts": table_of_verdicts,
     "remarks": table_of_remarks,
+    "tests": table_of_tests,
     "commands": commands,
     "reference": reference,
 }

@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, with_slopes
-from etid.estimators.score_tests import FALSE_ALARMS
+from etid.circuits.directions import FALSE_ALARMS
 from etid.recordings.repeats import ALIGNED, Repeats
 from etid.results.driver import Driver
 from etid.results.feed import AbstractFeed

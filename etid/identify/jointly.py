@@ -152,7 +152,7 @@ def _together(
             sizes = told.complete().deviations(of.calibration.r_load.size) / of.tolerances
             moved = found.by_error.T * sizes[:, None]
             later = jnp.full((len(LATER), moved.shape[-1]), jnp.nan)  # nothing changes between them
-            effects = Effects.of_errors(moved, told, later)
+            effects = Effects.of_errors(moved, later, told.budgeted())
             estimate = dataclasses.replace(estimate, by_tolerance=effects)
         fit = judgement.judged(estimate, model.circuit, driver.result, *of_model)
         fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)

@@ -12,8 +12,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from etid.circuits.directions import SEEN
 from etid.estimators.lanes import replaced, taken
-from etid.estimators.score_tests import SEEN
 from etid.results.fit import Fit
 from etid.results.verdicts import verdicts_of
 

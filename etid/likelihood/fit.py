@@ -1,11 +1,13 @@
 """The fit of loads behind one driver: elements, standard errors, and what the data contradict."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from etid.likelihood import directions, scores
+from etid.circuits.directions import DIRECTIONS, ON_LOADS, SEEN, named, scored
+from etid.likelihood import scores
 from etid.likelihood.arrays import array_function
 from etid.likelihood.linear import diagonal, inverse
 from etid.likelihood.noise import excess, shows_hum
@@ -14,22 +16,11 @@ from etid.likelihood.search import Load, minimum
 from etid.likelihood.source import Errors
 from etid.precision import namespace
 from etid.results.fit import Support
-from etid.results.instrument import BUDGETED, Effects
+from etid.results.instrument import BUDGETED, LATER, Effects
 from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex, power
 
-FAULTS = 3  # errors of the instrument that act on a load: gain, crosstalk, capacitance
-SEEN = 3.9  # standard deviations; a normal number exceeds it once in 10 000
-# The fast relaxations have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for six poles), so that
-# this is in fact `SEEN`.
-SEEN_RELAXATION = 5.0
-# α or ε must also deviate by this, which changes R_s by a few per cent. A driver whose order is too
-# low can imitate 0.002: four standard deviations at 60 dB with damp skin.
-SPREAD = 0.01
-MOVED = 0.02  # relative change of an element that is also necessary, for the same reason
-# Relative change of an element, from which on the scale of a current measured beside V_th is wrong.
-# A driver of too low order can imitate less.
-SCALE = 1e-3
+FAULTS = len(ON_LOADS)  # errors of the instrument that act on a load
 DOUBTED = 2.5  # standard deviations of a gain that goes into ±; one good recording in 80 has them
 GAIN = 0.02  # standard deviation of the gain between two channels that nobody compared
 NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
@@ -64,6 +55,7 @@ class Estimate(NamedTuple):
             driver.
         support: How well the data support the circuit.
         effects: What errors of the instrument do to the elements.
+        tested: Scores of each of `scored`, and of a falling resistance.
     """
 
     logs: Float[AnyArray, "*row element"]
@@ -83,13 +75,14 @@ class Estimate(NamedTuple):
     inconsistent: Bool[AnyArray, "*row"]
     support: Support
     effects: Effects
+    tested: Mapping[str, Scores]
 
 
 @array_function
 def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0) -> Estimate:
     """The fits from their starts; for the arguments see `etid.likelihood.search.minimum`."""
     xp, gains = namespace(starts), load.gains
-    source, e, owned, outputs = gains.source, gains.elements, gains.owned, gains.outputs.count
+    source, e, owned = gains.source, gains.elements, gains.owned
     every, at_knots = load.knots, gains.at(load.knots.index)
     least = minimum(load, starts, aside)
     # Standard errors and tests are those of the last point; they do not change in a short step.
@@ -113,27 +106,27 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
         spread,
         precision,
     )
-    changes = [directions.of_circuit(at_knots, near), directions.of_instrument(at_knots, near)]
-    changes = xp.concatenate(changes, -3)
-    tested, last = scores.smooth(linear, condensed.rows(changes), e), changes.shape[-3]
-    circuits, first = 2 + directions.RELAXATIONS, last - outputs
-    layer, spreads = tested.of_changes(0), tested.of_changes(1)
-    relaxations = tested.of_changes(slice(2, circuits))
-    scales = tested.of_changes(slice(first, last))
-    crosstalk, capacitance = tested.of_changes(circuits), tested.of_changes(circuits + 1)
-    gain = scales.of_changes(0)
-    added = directions.falling(near, every)
-    falling = scores.rough(linear, added, near, every, share, noise, e).of_changes(0)
+    place = at_knots.departing(at, near.slopes)
+    changes = {name: DIRECTIONS[name].change(place) for name in scored()}
+    rows = condensed.rows(xp.concatenate(list(changes.values()), -3))
+    each = scores.smooth(linear, rows, e)
+    each = each.named({name: of.shape[-3] for name, of in changes.items()})
+    gain, spreads, layer = (each[name].of_changes(0) for name in ("gain", "spread", "layer"))
+    added = scores.falling(near, every)
+    each["falling"] = scores.rough(linear, added, near, every, share, noise, e)
+    fall = each["falling"].of_changes(0)
 
     squares, terms = 2 * profile.objective, records.terms
-    relevant = _relevant(spreads, relaxations, gain)
-    falls = (falling.z > SEEN) & (falling.moved > MOVED)
+    seen = {name: DIRECTIONS[name].seen(*of[:3]).any(-1) for name, of in each.items()}
+    seen["falling"] = seen["falling"] & (fall.z > 0)
+    relevant = [DIRECTIONS[name].relevant(*each[name][:3]) for name in named()]
+    relevant = xp.concatenate(relevant, -1)
     over = squares - terms - UNSURE * xp.sqrt(2 * terms)
-    causes = falls & (falling.z >= xp.abs(relevant).max(-1)) & (falling.explained > SHARE * over)
+    causes = (fall.z >= xp.abs(relevant).max(-1)) & (fall.explained > SHARE * over)
 
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
     made = (gain.others[..., None, None] * near.by_q(near.slopes)).sum(-3)
-    of_gain = changes[..., first, :, :] - made
+    of_gain = changes["gain"][..., 0, :, :] - made
     explained = (as_complex(-gain.size)[..., None] * profile.x)[..., None, :]
     explained = profile.whitened(explained * every.between(of_gain))
     without = power(profile.innovations - explained) / profile.expected
@@ -152,8 +145,7 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
     if load.unloaded is not None:
         of_unloaded = (mean_noise - mean_private)[..., None, :]
         shared = shared + (by_term * of_unloaded) @ by_term.swapaxes(-1, -2)
-    proven = gain.exceeds(SEEN, MOVED)
-    doubtful = (xp.abs(gain.z) > DOUBTED) & ~proven
+    doubtful = (xp.abs(gain.z) > DOUBTED) & ~seen["gain"]
     mean = gain.size / (1 + (gain.stderr / GAIN) ** 2)
     shift = xp.where(doubtful[..., None], mean[..., None] * gain.slope, 0.0)
     shared = shared + shift[..., :, None] * shift[..., None, :]
@@ -176,9 +168,11 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
         xp.where(possible[..., None], spreads.slope, 0.0),
         _would_show(layer, np.asarray(gains.circuit.scaling()[0])),
     )
-    seen = (xp.abs(spreads.z) > SEEN) & (xp.abs(spreads.size) > SPREAD)
-    seen = seen | relaxations.exceeds(SEEN_RELAXATION, MOVED).any(-1)
-    contradicts = scales.of_changes(slice(1, None)).exceeds(SEEN, SCALE).any(-1)
+    found = {
+        verdict: sum(seen[name] for name in seen if DIRECTIONS[name].verdict == verdict) > 0
+        for verdict in ("misfit", "inconsistent")
+    }
+    contradicts = found["inconsistent"]
     width = load.width[e]  # of the prior of the delay of V_out
     contradicts = contradicts | _beyond(delays[..., 0] / width, bread[..., e, e] / width**2)
     if source.tolerances is not None and source.errors is not None:
@@ -186,7 +180,7 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
         told = (by_z * (bread[..., owned:, owned:] @ by_z)).sum(-2)
         errors = source.errors.at + z @ source.errors.by_z
         contradicts = contradicts | _beyond(errors[..., :FAULTS], told).any(-1)
-    direct = xp.stack([of.others for of in (gain, crosstalk, capacitance)], -2)
+    direct = xp.concatenate([each[name].others for name in ON_LOADS], -2)
     return Estimate(
         logs=logs,
         delays=delays,
@@ -198,13 +192,14 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
         points=least.points,
         strain=strain,
         hum=hum & ~wrong_gain,
-        falls=causes,
+        falls=causes & seen["falling"],
         doubtful=doubtful,
         far=xp.sqrt(moved) > FAR,
-        other=seen | proven | falls,
+        other=found["misfit"],
         inconsistent=contradicts,
         support=support,
         effects=_effects(source.errors, bread, direct, e, owned),
+        tested=each,
     )
 
 
@@ -214,14 +209,6 @@ def _block(own: Float[AnyArray, " own"], of_source: Float[AnyArray, "z z"]) -> A
     upper = xp.concatenate([own[:, None] * np.eye(count), xp.zeros((count, z))], 1)
     lower = xp.concatenate([xp.zeros((z, count)), of_source], 1)
     return xp.concatenate([upper, lower], 0)
-
-
-def _relevant(spread: Scores, relaxations: Scores, gain: Scores) -> AnyArray:
-    """Z of all changes; 0 if a change is too small to matter."""
-    xp = namespace(gain.z)
-    first = xp.where(xp.abs(spread.size) > SPREAD, xp.nan_to_num(spread.z), 0.0)
-    others = [xp.where(of.moved > MOVED, xp.nan_to_num(of.z), 0.0) for of in (relaxations, gain)]
-    return xp.concatenate([first[..., None], others[0], others[1][..., None]], -1)
 
 
 def _would_show(layer: Scores, powers: np.ndarray) -> Float[AnyArray, "*row"]:
@@ -262,12 +249,11 @@ def _effects(
         return Effects.unknown(e, *bread.shape[:-2])
     xp, elements, direct = namespace(bread), bread[..., :e, owned:], direct[..., :e]
     moved = (elements @ (errors.by_z + errors.unstated)).swapaxes(-1, -2)
-    of_record = xp.abs(moved[..., :FAULTS, :] - errors.direct[:, None] * direct)
-    each = moved[..., FAULTS:, :]
-    each = each.reshape(*each.shape[:-2], 2, -1, e)  # the resistors are independent
-    of_resistors = xp.sqrt((each**2).sum(-2))
-    drift = xp.sqrt(((elements @ errors.drift) ** 2).sum(-1))[..., None, :]
-    later = BUDGETED["later gain"] * xp.abs(direct[..., :1, :])
-    parts = of_record[..., :1, :], of_resistors, of_record[..., 1:, :], drift, later
-    stated = xp.broadcast_to(errors.stated, (*bread.shape[:-2], errors.stated.shape[-1]))
-    return Effects(xp.concatenate(parts, -2), stated)
+    own = moved[..., :FAULTS, :] - errors.direct[:, None] * direct
+    drift = xp.sqrt(((elements @ errors.drift) ** 2).sum(-1))
+    of = {
+        "drift": drift,
+        "later gain": BUDGETED["later gain"] * direct[..., ON_LOADS.index("gain"), :],
+    }
+    moved = xp.concatenate([own, moved[..., FAULTS:, :]], -2)
+    return Effects.of_errors(moved, xp.stack([of[name] for name in LATER], -2), errors.stated)

@@ -4,7 +4,7 @@ The parameters q of a fit are the logarithms of the elements, the delay of each 
 and z of `etid.likelihood.source`. All act on a frequency through Z_L, the phase factors of the
 delays, and W.
 
-A gain g, a crosstalk κ and a capacitance C of the instrument change the outputs of a load,
+Errors of the instrument that act on loads change them as `DIRECTIONS` says,
 
     V_out / V_th = (1 + g) Z' / (Z' + Z_th) + κ,      Z' = Z_L ‖ C.
 
@@ -13,12 +13,14 @@ Another kind of data is another class of outputs.
 
 import abc
 import dataclasses
+import functools
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, impedance_at, with_slopes
+from etid.circuits.directions import DIRECTIONS, ON_LOADS, At, Direction
 from etid.likelihood.arrays import along_outputs
 from etid.likelihood.source import Source
 from etid.precision import namespace
@@ -75,33 +77,15 @@ class Slopes(NamedTuple):
         z: Z_L [Ω].
         gains: The gains.
         by_z: Derivatives with respect to Z_L.
+        by_source: Derivatives with respect to Z_th.
         by_q: Derivatives with respect to the parameters.
     """
 
     z: Complex[AnyArray, "*row bin"]
     gains: Complex[AnyArray, "*row output bin"]
     by_z: Complex[AnyArray, "*row output bin"]
+    by_source: Complex[AnyArray, "*row output bin"]
     by_q: Complex[AnyArray, "*row q output bin"]
-
-
-class Faults(NamedTuple):
-    """Errors of the instrument that act on a load.
-
-    Attributes:
-        gain: g.
-        crosstalk: κ.
-        capacitance: C [F].
-        by_z: Their derivatives.
-    """
-
-    gain: Complex[AnyArray, "*row 1"]
-    crosstalk: Complex[AnyArray, "*row 1"]
-    capacitance: Complex[AnyArray, "*row 1"]
-    by_z: Float[AnyArray, "z 3"]
-
-    def share(self, z_load: _Numbers, s: Complex[AnyArray, "... bin"]) -> _Numbers:
-        """Z' / Z_L."""
-        return reciprocal(1 + s * self.capacitance * z_load)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,28 +140,41 @@ class Gains:
         off = xp.log(self.frequency[..., :1] / self.source.frequency[0])
         return self.source.w(z, off)
 
-    def _faults(self, z: Float[AnyArray, "*row z"]) -> "Faults | None":
+    def _faults(self, z: Float[AnyArray, "*row z"]) -> list[tuple[Direction, _Numbers]]:
+        """Errors of the instrument that act on a load, and their sizes; none without tolerances."""
         of = self.source.tolerances
         if of is None:
-            return None
-        errors = as_complex(of.faults + z @ of.faults_by_z)
-        gain, crosstalk, capacitance = (errors[..., i, None] for i in range(3))
-        return Faults(gain, crosstalk, capacitance, of.faults_by_z)
+            return []
+        sizes = as_complex(of.faults + z @ of.faults_by_z)
+        return [(DIRECTIONS[name], sizes[..., i, None]) for i, name in enumerate(ON_LOADS)]
+
+    def _turn(self, delays: Float[AnyArray, "*row output"]) -> Complex[AnyArray, "*row output bin"]:
+        cycles = -delays[..., None] * (self.frequency[..., None, :] / self.sample_rate)
+        angle = 2 * np.pi * cycles
+        return namespace(angle).cos(angle) + 1j * namespace(angle).sin(angle)
+
+    def departing(self, q: Float[AnyArray, "*row q"], slopes: Slopes) -> At:
+        """The loads, from which a recording may depart in any of `DIRECTIONS`."""
+        logs, delays, _ = self.split(q)
+        each = slopes.gains, slopes.by_z, slopes.by_source, self._turn(delays)
+        impedance = functools.partial(impedance_at, self.circuit, logs)
+        return At(self.frequency, slopes.z, *each, impedance, bool(self.circuit.exponents()))
 
     def __call__(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
         """The gains at all harmonics."""
         at, (_, delays, z) = self.impedance(q), self.split(q)
-        faults = self._faults(z)
-        if faults is not None:
-            at = at * faults.share(at, frequency_variable(self.frequency))
+        faults, place = self._faults(z), At(self.frequency, at)
+        for of, size in faults:
+            place = place._replace(z=of.of_load(place, size)[0])
+        at = place.z
         if self.source.loaded is None:
             current = namespace(q).ones_like(at)
         else:
             total = at + self.source.z_loaded(self.w(z))
             current = reciprocal(total - as_complex(self.source.resistance))
         values = [value for value, *_ in self.outputs(at, current)]
-        if faults is not None:
-            values[0] = values[0] * (1 + faults.gain) + faults.crosstalk
+        for of, size in faults:
+            values[0] = values[0] * of.factor(place, size) + of.offset(place, size)
         cycles = -delays * (self.frequency[..., :1] / self.sample_rate)
         return along_outputs(values) * turns(cycles, self.frequency.shape[-1])
 
@@ -185,41 +182,42 @@ class Gains:
         """The gains and their derivatives, at a few frequencies."""
         xp, (logs, delays, z) = namespace(q), self.split(q)
         z_load, by_element = with_slopes(self.circuit, logs, self.frequency)
-        s, faults, at, share = frequency_variable(self.frequency), self._faults(z), z_load, None
-        if faults is not None:
-            share = faults.share(z_load, s)
-            at = z_load * share
+        faults, place, share = self._faults(z), At(self.frequency, z_load), 1.0
+        for of, size in faults:
+            changed, slope = of.of_load(place, size)
+            place, share = place._replace(z=changed), share * slope
+        at, turn = place.z, self._turn(delays)
         if self.source.loaded is None:
             current = xp.ones_like(at)
-            by_total = by_w = xp.zeros_like(at)
+            loaded = by_total = xp.zeros_like(at)
         else:
             loaded = self.source.z_loaded(self.w(z))
             current = reciprocal(at + loaded - as_complex(self.source.resistance))
             by_total = -current * current
-            by_w = by_total * loaded
         each = self.outputs(at, current)
-        values = along_outputs([value for value, *_ in each])
-        by_at = along_outputs([own + of_current * by_total for _, own, of_current in each])
-        of_w = along_outputs([of_current * by_w for *_, of_current in each])
-        cycles = -delays[..., None] * (self.frequency[..., None, :] / self.sample_rate)
-        angle = 2 * np.pi * cycles
-        turn = xp.cos(angle) + 1j * xp.sin(angle)
-        values, by_at, of_w = values * turn, by_at * turn, of_w * turn
-        by_fault = None
-        if faults is not None and share is not None:
+        values = along_outputs([value for value, *_ in each]) * turn
+        by_at = along_outputs([own + of_current * by_total for _, own, of_current in each]) * turn
+        by_source = along_outputs([of_current * by_total for *_, of_current in each]) * turn
+        of_faults = None
+        if faults:
             first = np.eye(self.outputs.count)[0][:, None]
-            of_gain = first * values
-            scale = 1 + first * faults.gain[..., None, :]
-            values = values * scale + first * faults.crosstalk[..., None, :] * turn
-            by_at, of_w = by_at * scale, of_w * scale
-            across = (-s * at * at)[..., None, :] * by_at
-            by_fault = xp.stack([of_gain, first * turn, across], -3)
-            by_at = by_at * (share * share)[..., None, :]
-        unit = np.eye(self.outputs.count)[:, :, None]
+            factor, offset = xp.ones_like(at), xp.zeros_like(at)
+            for of, size in faults:
+                factor = factor * of.factor(place, size)
+                offset = offset + of.offset(place, size)
+            scale = 1 + first * (factor - 1)[..., None, :]
+            by_at, by_source = by_at * scale, by_source * scale
+            place = place._replace(gains=values, by_z=by_at, by_source=by_source, turn=turn)
+            of_faults = xp.concatenate([of.change(place) for of, _ in faults], -3)
+            values = values * scale + first * offset[..., None, :] * turn
+            by_at = by_at * (share * xp.ones_like(at))[..., None, :]
+        unit, s = np.eye(self.outputs.count)[:, :, None], frequency_variable(self.frequency)
         by_delay = unit * ((-s / self.sample_rate)[..., None, :] * values)[..., None, :, :]
+        of_w = by_source * loaded[..., None, :]
         by_z = self.source.w_by_z(z)[..., None, :] * of_w[..., None, :, :]
-        if faults is not None and by_fault is not None:
-            of_errors = faults.by_z[:, :, None, None] * by_fault[..., None, :, :, :]
-            by_z = by_z + of_errors.sum(-3)
+        if of_faults is not None and self.source.tolerances is not None:
+            sizes = self.source.tolerances.faults_by_z[:, :, None, None]
+            by_z = by_z + (sizes * of_faults[..., None, :, :, :]).sum(-3)
         own = by_element[..., None, :] * by_at[..., None, :, :]
-        return Slopes(z_load, values, by_at, xp.concatenate([own, by_delay, by_z], -3))
+        by_q = xp.concatenate([own, by_delay, by_z], -3)
+        return Slopes(z_load, values, by_at, by_source, by_q)

@@ -11,19 +11,27 @@ The covariance is a "sandwich" (White 1980, Econometrica 48),
 
 with the derivatives J of the terms, the variance C of each term, the share W of signal in each
 term, and the curvature P of the priors, which is also the covariance of their gradient.
+
+**A resistance that falls with its current** is no change of the gains: harmonics mix. To first
+order in 1/I_0, a resistor R / (1 + |i|/I_0) adds the voltage −|u| u / (R I_0) to its own voltage u.
+The rest of the circuit filters it like the voltage of the relaxations, and the feed like a change
+of Z_L. So it is a change of the outputs at all harmonics.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Complex, Float
 
 from etid.likelihood.linear import inverse
 from etid.likelihood.search import Near
 from etid.precision import namespace
 from etid.signals.knots import Knots
-from etid.signals.transfer import AnyArray, as_complex, power
+from etid.signals.transfer import AnyArray, as_complex, power, reciprocal
 
+HARMONICS = 512  # that a pulse needs, up to 30 kHz; without the rest z is a few per cent smaller
+FINE = 2  # points of the grid in time, relative to twice the number of these harmonics
 NOTHING = 1e-9  # of the power of a change; rounding leaves less of one that the circuit can make
 
 
@@ -114,9 +122,11 @@ class Scores(NamedTuple):
         keep = [(..., which) if n == 1 else (..., which, slice(None)) for n in axis]
         return Scores(*(of[place] for of, place in zip(self, keep, strict=True)))
 
-    def exceeds(self, limit: float, moved: float) -> Bool[AnyArray, "*row change"]:
-        """Whether z exceeds this limit and the change moves an element by so much."""
-        return (namespace(self.z).abs(self.z) > limit) & (self.moved > moved)
+    def named(self, counts: Mapping[str, int]) -> dict[str, "Scores"]:
+        """Those of changes with these names, each of so many in their order."""
+        ends = np.cumsum(list(counts.values())).tolist()
+        places = zip(counts, [0, *ends[:-1]], ends, strict=True)
+        return {name: self.of_changes(slice(first, last)) for name, first, last in places}
 
 
 def smooth(linear: Linear, rows: Float[AnyArray, "*row change part"], elements: int) -> Scores:
@@ -166,3 +176,23 @@ def rough(
     score, variance, curvature = (one[..., None] for one in (total, variance, curvature))
     none = xp.zeros_like(curvature)
     return Scores.of(score, variance, curvature, none, others[..., None, :], elements)
+
+
+def falling(near: Near, knots: Knots) -> Complex[AnyArray, "*row output bin"]:
+    """What a resistance that falls with its current adds to the outputs, for 1/(R I_0) = 1/V.
+
+    The current is that of the pulse, whose shape the first harmonics give.
+    """
+    xp, slopes = namespace(near.q), near.slopes
+    relaxing = slopes.z - slopes.z[..., -1:].real  # without the series resistor
+    v_out = knots.between(slopes.gains[..., 0, :]) * near.profile.x
+    count = min(HARMONICS, v_out.shape[-1])
+    u = (v_out * knots.between(relaxing * reciprocal(slopes.z)))[..., :count]
+    # There is no direct voltage behind a transformer, or with charge-balanced pulses.
+    whole = xp.concatenate([xp.zeros_like(u[..., :1]), u], -1)
+    points = xp.fft.irfft(whole, 2 * FINE * count, norm="forward")
+    added = xp.fft.rfft(-xp.abs(points) * points, norm="forward")[..., 1 : count + 1]
+    rest = xp.zeros((*added.shape[:-1], v_out.shape[-1] - count), added.dtype)
+    added = xp.concatenate([added, rest], -1)
+    sensitivity = slopes.by_z * (slopes.z * reciprocal(slopes.gains[..., 0, :]))[..., None, :]
+    return added[..., None, :] * knots.between(sensitivity * relaxing[..., None, :])

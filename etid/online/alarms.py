@@ -49,7 +49,7 @@ average out. With the sums over the pulses since the electrode began anew,
     z² = (Σs)² / (ΣI + (Σc)²)
 
 has at most the distribution χ² with one degree of freedom. A gain g₀ that moves an element by
-`MOVED` does not matter (`etid.estimators.score_tests.other_circuit`), and instruments have smaller
+`MOVED` does not matter (`etid.circuits.directions`), and instruments have smaller
 ones, which many pulses show. So a gain is wrong if it exceeds this one:
 
     |Σs| − g₀ ΣI  >  SEEN_IN_PULSES √(ΣI + (Σc)²).
@@ -67,10 +67,12 @@ import jax.numpy as jnp
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from etid.estimators.score_tests.other_circuit import MOVED, NOTHING, SPREAD, Score
+from etid.circuits.directions import DIRECTIONS
+from etid.estimators.score_tests.other_circuit import NOTHING, Score
 from etid.online.pulse_fit import Expected, Pulse
 from etid.solvers.matrices import inverse_of_few
 
+MOVED, SPREAD = DIRECTIONS["gain"].moves, DIRECTIONS["spread"].least
 FALSE_ALARMS = 0.05  # per electrode and hour, expected if T and Q have exactly their distributions
 WEIGHT = 0.1  # λ, of the newest innovation in the moving mean
 DRIVER = 9.0  # standard deviations; no false alarm is expected in a year
@@ -232,4 +234,4 @@ def score_of(sums: Float[Array, " 3"], slope: Float[Array, " element"]) -> Score
     """The score of a change from its sums s, I and c, and the slopes of the elements."""
     size, stderr = estimate(sums)
     moved = jnp.abs(size) * jnp.max(jnp.abs(slope))
-    return Score(size / stderr, size, moved, stderr, slope)
+    return Score(size / stderr, size, moved, stderr, slope, slope)

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit, with_slopes
+from etid.circuits.directions import At, spread
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_bands import Bands
 from etid.online.noise import cleared
@@ -46,7 +46,7 @@ class Expected(NamedTuple):
         gain: G in each band.
         slope: Its derivatives with respect to the logarithms of the elements.
         spread: Its derivative with respect to a spread of the time constants, ε in
-            `etid.estimators.score_tests.other_circuit`.
+            `etid.circuits.directions`.
         aliased: Aliases, for a delay of 0.
     """
 
@@ -134,10 +134,12 @@ class GainModel(Module):
         admittance = reciprocal(z + self.source)
         by_z = self.source * admittance * admittance
         circuit = self.circuit.with_log_values(logs)
-        _, spread = other_circuit.spread(circuit.impedance(), self.bands.frequency)
+        alike = At(
+            self.bands.frequency, z, impedance=circuit.response, exponents=bool(circuit.exponents())
+        )
         above = circuit.response(self.bands.sample_rate - self.bands.frequency)
         aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
-        return Expected(z * admittance, by_element * by_z[None, :], spread * by_z, aliased)
+        return Expected(z * admittance, by_element * by_z[None, :], spread(alike) * by_z, aliased)
 
     def departure(self, at: "Expected", delay: Float[Array, ""]) -> Complex[Array, " band"]:
         """Ĝ − G e^(−jωτ): aliases, and the effect of the curvature of G over a band."""

@@ -13,9 +13,8 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import Description
 from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
 from etid.estimators.registry import register_description
-from etid.estimators.score_tests.other_circuit import MOVED, SPREAD
 from etid.estimators.unknowns import LoadUnknowns
-from etid.online.alarms import SEEN_IN_PULSES, score_of
+from etid.online.alarms import MOVED, SEEN_IN_PULSES, SPREAD, score_of
 from etid.online.noise import Noise, directions
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
 from etid.online.repeats import Windows

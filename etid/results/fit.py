@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import Circuit
+from etid.circuits.directions import ALIKE, DIRECTIONS, FAST, SPREAD, Direction, named
 from etid.circuits.display import quality, quantity, rounded, several
 from etid.circuits.overview import Overview, element_rows
 from etid.precision import Module
@@ -23,10 +24,7 @@ from etid.results.instrument import Effects, largest
 from etid.results.method_options import without_known
 from etid.results.posterior import tails
 from etid.results.verdicts import RESULTS, Judged, counted, message
-from etid.signals.transfer import power
-
-CHANGES = 9  # changes that the score tests try: a spread, seven relaxations, a gain
-_FAST = 3  # number of relaxations at the upper end of the band
+from etid.signals.transfer import AnyArray, power
 
 
 def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
@@ -72,10 +70,9 @@ class Support(Module):
     Attributes:
         deviance: −2 log L at the minimum, up to a constant that depends on the data only.
         terms: Number of real numbers in the data.
-        z: Score of each change that the circuit cannot make [standard deviations]: a spread of time
-            constants, more relaxations from slow to fast, and another gain of V_out. 0 if the
-            change is too small to matter, or if the circuit can make it itself.
-        spread_stderr: Standard error of the size of the first change, the spread; 0 if the circuit
+        z: Score of each change of `named` [standard deviations]. 0 if the change is too small to
+            matter, or if the circuit can make it itself.
+        spread_stderr: Standard error of the size of the spread; 0 if the circuit
             can make it itself.
         spread_slope: Change of the logarithm of each element for each unit of this size.
         layer_shows: How much the data would show that the load is a layer through which charge
@@ -90,44 +87,63 @@ class Support(Module):
     spread_slope: Float[Array | np.ndarray, "*lane element"]
     layer_shows: Float[Array | np.ndarray, "*lane"]
 
+    @staticmethod
+    def changes() -> int:
+        """Number of scores."""
+        return sum(DIRECTIONS[name].count for name in named())
+
     @classmethod
     def unknown(cls, elements: int, *lane: int) -> "Support":
         """The support of a fit whose estimator does not compute it, or of a batch of them: NaN."""
-        sizes = (), (), (CHANGES,), (), (elements,), ()
+        sizes = (), (), (cls.changes(),), (), (elements,), ()
         return cls(*(np.full((*lane, *size), np.nan) for size in sizes))
 
-    def _passive(self) -> Float[np.ndarray, " change"]:
-        """The scores of the changes that a passive circuit can make; 0 for all others.
+    def of(self, name: str) -> Float[AnyArray, "*lane change"]:
+        """The scores of one of `named`."""
+        first = sum(DIRECTIONS[other].count for other in named()[: named().index(name)])
+        return self.z[..., first : first + DIRECTIONS[name].count]
+
+    def _likeliest(self) -> tuple[float, list[tuple[Direction, str]]]:
+        """The largest score that a passive load can have, and what the residual looks like then.
 
         A negative relaxation, or a spread above that of a capacitor, is not passive. A gain has no
-        sign that it must have.
+        sign that it must have. For one fit.
         """
-        z = np.nan_to_num(np.asarray(self.z, float))
-        return np.append(np.maximum(z[:-1], 0.0), np.abs(z[-1]))
+        found = []
+        for name in named():
+            row, z = DIRECTIONS[name], np.nan_to_num(np.asarray(self.of(name), float))
+            # The scores have the sign of −ε.
+            z = np.maximum(-row.passive * z, 0.0) if row.passive else np.abs(z)
+            found += [(size, row, looks) for size, looks in zip(z.tolist(), row.looks, strict=True)]
+        circuits = [each for each in found if each[1].of_circuit]
+        other, spread = max(circuits, key=operator.itemgetter(0)), circuits[0]
+        faults = [each for each in found if not each[1].of_circuit]
+        if other[0] > other[1].limit:
+            # It changes the load much as a capacitance or an inductance does. Only a fast
+            # relaxation beyond the band does it alike.
+            faults = [
+                each
+                for each in faults
+                if not each[1].on_load or ALIKE < each[0] / other[0] < 1 / ALIKE
+            ]
+        worst = max(other, *faults, key=operator.itemgetter(0))
+        if worst[1].on_load and spread[0] > max(SPREAD * other[0], spread[1].limit):
+            return spread[0], [spread[1:]]
+        if worst is other and other[2] != FAST:
+            return other[0], [other[1:]]
+        return worst[0], [each[1:] for each in (other, *faults) if each[0] > ALIKE * worst[0]]
 
     def looks_like(self) -> str:
         """A sentence on the largest score; empty if the residual looks like no change.
 
         For one fit.
         """
-        z = self._passive()
-        if z.max() < 3.0:
+        z, causes = self._likeliest()
+        if z < 3.0:
             return ""
-        worst, last = int(np.argmax(z)), z.size - 1
-        if worst == 0:
-            what = "a spread of time constants that the circuit cannot make"
-        elif worst == last:
-            what = "another gain of v_out than of v_th"
-        elif worst <= 2:
-            what = "one more slow relaxation, a slow tail after each pulse"
-        elif worst >= last - _FAST:
-            what = (
-                "one more fast relaxation at the edges of each pulse, of the load or of the driver "
-                "(a higher order)"
-            )
-        else:
-            what = "one more relaxation in the middle of the band"
-        return f"The residual looks like {what} ({z[worst]:.0f} standard deviations)."
+        *first, last = [looks for _, looks in causes]
+        what = f"{', '.join(first)} or {last}" if first else last
+        return f"The residual looks like {what} ({z:.0f} standard deviations)."
 
     def is_of_circuit(self) -> bool:
         """Whether the largest score is surely that of another circuit; for one fit.
@@ -135,8 +151,8 @@ class Support(Module):
         A driver that changed looks like one more fast relaxation, and less spread than a capacitor
         has: so do all of 16 drivers with 30 % more leakage inductance at 40 dB.
         """
-        z = self._passive()
-        return bool(z.max() >= 5.0 and np.argmax(z) < z.size - 1 - _FAST)
+        z, [(row, looks), *more] = self._likeliest()
+        return z >= 5.0 and row.of_circuit and looks != FAST and not more
 
 
 class Limited(Module):

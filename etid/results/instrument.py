@@ -8,44 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from etid.circuits.directions import DIRECTIONS, ON_LOADS
 from etid.circuits.display import per_cent
 from etid.circuits.overview import Overview, Overviewed
-from etid.precision import Module
+from etid.precision import Module, namespace
+from etid.signals.transfer import AnyArray
 
 _Number = float | Float[Array | np.ndarray, ""]
 _Kind = TypeVar("_Kind", bound="Instrument")
 
-# Errors that a fit estimates with the elements. The value is that for which a budget shows the
-# effect of an error that nobody stated [relative, F].
-ERRORS = {
-    "gain": 1e-3,
-    "r_load": 1e-3,
-    "c_load": 1e-12,
-    "crosstalk": 1e-3,
-    "capacitance": 1e-12,
-}
-# Others that a fit of one recording can have. Nobody can state the last one.
-LATER = {"drift": 1e-2, "later gain": 1e-3}
-BUDGETED = ERRORS | LATER
-# Value of each tolerance from which on it has a wrong unit, and the unit.
-TOLERANCES = {
-    "gain": (1.0, "relative"),
-    "r_load": (1.0, "relative"),
-    "c_load": (1e-7, "F"),
-    "crosstalk": (1.0, "relative"),
-    "capacitance": (1e-7, "F"),
-    "drift": (1.0, "relative"),
-    "delay": (1e-3, "s"),
-}
-IN_WORDS = {  # an error of some size
-    "gain": "a gain that is {} off",
-    "r_load": "a known resistor that is {} off",
-    "c_load": "{} across the known resistor",
-    "crosstalk": "{} of crosstalk",
-    "capacitance": "{} across the skin",
-    "drift": "a driver that drifts by {}",
-    "later gain": "a gain that changes by {} after the calibration",
-}
+# Errors of which a budget shows the effect, of this size where nobody stated them [relative, F].
+BUDGETED = {name: of.usual for name, of in DIRECTIONS.items() if of.usual}
+# Those that a fit estimates with the elements; the others are later than its calibrations.
+ERRORS = {name: size for name, size in BUDGETED.items() if DIRECTIONS[name].records}
+OF_RESISTORS = tuple(name for name in ERRORS if name not in ON_LOADS)
+LATER = tuple(name for name in BUDGETED if name not in ERRORS)
+TOLERANCES = tuple(name for name, of in DIRECTIONS.items() if of.largest)
 NARROW = 1e-3  # of a tolerance that nobody stated: a prior that no recording changes
 
 
@@ -77,7 +55,8 @@ class Instrument(Module):
     delay: _Number | None = None
 
     def __check_init__(self) -> None:
-        for name, (largest, unit) in TOLERANCES.items():
+        for name in TOLERANCES:
+            largest, unit = DIRECTIONS[name].largest, DIRECTIONS[name].unit
             value, least = getattr(self, name), "above 0" if name == "delay" else "at least 0"
             if value is None or hasattr(value, "shape"):  # arrays, which may be traced
                 continue
@@ -107,14 +86,14 @@ class Instrument(Module):
         return cls(**found)
 
     def deviations(self, resistors: int) -> Float[Array, " error"]:
-        """Standard deviations of gain, crosstalk, capacitance, and of each known resistor.
+        """Standard deviations of `ON_LOADS`, then each of `OF_RESISTORS` of each known resistor."""
+        each = *ON_LOADS, *(name for name in OF_RESISTORS for _ in range(resistors))
+        return jnp.stack([jnp.asarray(getattr(self, name)) for name in each])
 
-        Those of the capacitances across the resistors follow.
-        """
-        of_loads = self.gain, self.crosstalk, self.capacitance  # change loads directly
-        of_each = self.r_load, self.c_load
-        every = *of_loads, *(of for of in of_each for _ in range(resistors))
-        return jnp.stack([jnp.asarray(of) for of in every])
+    def budgeted(self) -> Float[Array, " error"]:
+        """The tolerance of each of `BUDGETED`; 0 if none is stated."""
+        told = [getattr(self, name, None) for name in BUDGETED]
+        return jnp.stack([jnp.asarray(0.0 if one is None else one) for one in told])
 
     def complete(self: _Kind) -> _Kind:
         """The same with the size in `BUDGETED` for each error that nobody stated."""
@@ -164,21 +143,19 @@ class Effects(Module):
     @classmethod
     def of_errors(
         cls,
-        moved: Float[Array, "error element"],
-        instrument: Instrument | None,
-        later: Float[Array, "later element"],
+        moved: Float[AnyArray, "*row error element"],
+        later: Float[AnyArray, "*row later element"],
+        stated: Float[AnyArray, "*row_or_not budgeted"],
     ) -> "Effects":
         """The effects of the errors of `Instrument.deviations` and of `LATER`."""
-        gain, crosstalk, capacitance = jnp.abs(moved[:3])
-        of_each = moved[3:].reshape(2, -1, moved.shape[-1])  # the resistors are independent
-        r_load, c_load = jnp.sqrt(jnp.sum(of_each**2, axis=1))
-        of = instrument or Instrument()
-        stated = [getattr(of, name, None) for name in BUDGETED]
-        of_errors = jnp.stack([gain, r_load, c_load, crosstalk, capacitance])
-        return cls(
-            jnp.concatenate([of_errors, jnp.abs(later)]),
-            jnp.stack([jnp.asarray(0.0 if one is None else one) for one in stated]),
-        )
+        xp, count = namespace(moved), len(ON_LOADS)
+        shape = *moved.shape[:-2], len(OF_RESISTORS), -1, moved.shape[-1]
+        of_each = moved[..., count:, :].reshape(shape)  # the resistors are independent
+        of_resistors = xp.sqrt((of_each**2).sum(-2))
+        every = xp.concatenate([xp.abs(moved[..., :count, :]), of_resistors, xp.abs(later)], -2)
+        order = [(*ON_LOADS, *OF_RESISTORS, *LATER).index(name) for name in BUDGETED]
+        stated = xp.broadcast_to(stated, (*moved.shape[:-2], len(BUDGETED)))
+        return cls(every[..., np.array(order), :], stated)
 
     @classmethod
     def unknown(cls, elements: int, *lane: int) -> "Effects":
@@ -222,14 +199,14 @@ def largest(
     if not beside:
         return ""
     _, source, i = max(beside)
-    what = IN_WORDS[source].format(_size(source, BUDGETED[source]))
+    what = DIRECTIONS[source].in_words.format(_size(source, BUDGETED[source]))
     return f"Not in ±: {what} would move {names[i]} by {per_cent(float(unstated[source][i]))}."
 
 
 def _size(source: str, size: float) -> str:
     """The size of an error, as in "0.1 %"."""
-    of_capacitance = source in ("c_load", "capacitance")
-    return f"{size * 1e12:g} pF" if of_capacitance else f"{100 * size:g} %"
+    in_farad = DIRECTIONS[source].unit == "F"
+    return f"{size * 1e12:g} pF" if in_farad else f"{100 * size:g} %"
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

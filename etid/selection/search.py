@@ -100,10 +100,10 @@ def _lacks(fit: Fit) -> float:
     """Largest score of the changes that the circuit cannot make [standard deviations]."""
     if fit.support is None:
         return 0.0
-    z = np.array(fit.support.z[:-1])  # without that of a gain
     # A negative score means less spread than a capacitor has, α > 1, which is not passive.
-    z[0] = max(z[0], 0.0)
-    return float(np.nanmax(np.abs(z), initial=0.0))
+    spread = np.maximum(fit.support.of("spread"), 0.0)
+    every = np.append(spread, fit.support.of("relaxation"))
+    return float(np.nanmax(np.abs(every), initial=0.0))
 
 
 def _is_known(fit: Fit) -> bool:

@@ -47,7 +47,7 @@ def unseen(fit: Fit) -> Float[np.ndarray, "element element"]:
     if not sigma > 0:
         return np.zeros((size, size))
     # A positive score means α < 1.
-    evidence, square = posterior(-float(support.z[0]) * sigma, sigma)
+    evidence, square = posterior(-float(support.of("spread")[0]) * sigma, sigma)
     moved = np.asarray(support.spread_slope, float) * values_of(fit)
     return evidence / (1 + evidence) * square * np.outer(moved, moved)
 

@@ -166,7 +166,7 @@ def estimates(
             if by_x is not None:  # its correlation with `common` makes less than 3 % of an error
                 of_x = jnp.where(load.unloaded >= 0, by_x.of_own.T @ by_x.of_own, 0.0)
                 private, shared = private - of_x, shared + of_x
-            other, scale = _scores(at, load, own, eliminated, bread, total.score)
+            other = _scores(at, load, own, eliminated, bread, total.score)
             likely, doubt = other.doubt()
             e = own.log_elements.size
             estimate = Estimate(
@@ -187,7 +187,7 @@ def estimates(
             by_error = of.errors(eliminated.slope[:e] @ bread)
             # A load that takes no part has its own verdict.
             wrong = other.misfit & load.used
-            inconsistent = beyond | ((scale | late) & load.used)
+            inconsistent = beyond | ((other.inconsistent | late) & load.used)
             return Found(estimate, wrong, inconsistent, delay, by_error)
 
         judged.append(in_turn(one, loads, own, *each, results))
@@ -234,7 +234,7 @@ def _at_minimum(
         rrse=profile.rrse(records, load.spectrum.x),
         terms=condensed.part,
         linear=linear,
-        changes=condensed.rows(changes(lane, near)),
+        changes=condensed.rows(jnp.concatenate(list(changes(lane, near).values()))),
     )
     brought = profile.whitened(profile.gains * as_complex(jnp.sqrt(records.variance_x))[None, :])
     brought = brought * as_complex(1 / jnp.sqrt(profile.expected))
@@ -258,8 +258,8 @@ def _scores(
     eliminated: _Eliminated,
     bread: Float[Array, "common common"],
     score: Float[Array, "common common"],
-) -> tuple[other_circuit.Scores, Bool[Array, ""]]:
-    """What a load shows of another circuit or gain, and whether the current has another scale.
+) -> other_circuit.Scores:
+    """What a load shows of another circuit, and of faults of its outputs.
 
     `bread` and `score` are those of `common` from all terms.
     """
@@ -279,13 +279,7 @@ def _scores(
         slice(bread.shape[0], bread.shape[0] + own.log_elements.size),
     )
     found = other_circuit.scores(at.changes, linear, at.terms, fitted)
-    scale = jnp.asarray(False)
-    if load.current is not None:
-        found, of_current = (
-            jax.tree.map(lambda leaf, part=part: leaf[part], found) for part in (slice(-1), -1)
-        )
-        scale = of_current.contradicts()
-    return other_circuit.Scores.of(found), scale
+    return other_circuit.Scores.of(found, 0 if load.current is None else 1)
 
 
 def _eliminated(at: _AtMinimum, c: int) -> _Eliminated:

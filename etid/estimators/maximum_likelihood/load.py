@@ -11,10 +11,10 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.directions import DIRECTIONS, At, scored
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.condensed import Condensed, Near, apart
 from etid.estimators.maximum_likelihood.gains import (
@@ -25,12 +25,12 @@ from etid.estimators.maximum_likelihood.gains import (
 )
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, UnloadedEstimate
 from etid.estimators.maximum_likelihood.profile import Profile, Records
-from etid.estimators.score_tests import falling_resistance, other_circuit
+from etid.estimators.score_tests import falling_resistance
+from etid.likelihood.arrays import array_function
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import (
     as_complex,
     combined,
-    frequency_variable,
     reciprocal,
     turns,
 )
@@ -128,33 +128,17 @@ class Load(eqx.Module):
         return near.profile.by_x(self.known(near.q), *self.unloaded[2:])
 
 
-def changes(load: Load, near: Near) -> Complex[Array, "change output knot"]:
-    """Derivatives of the gains with respect to changes of the circuit, then to a gain of each.
-
-    The changes are those of `etid.estimators.score_tests.other_circuit`. A gain of V_out that is
-    1 % too large makes R_p of dry skin wrong by a quarter, and χ² shows this only at 60 dB.
-    """
-    frequency = load.knots.at(load.gains.frequency)
-    _, circuits = other_circuit.changes(load.gains.impedance(near.q), frequency)
-    alone = np.eye(load.gains.outputs, dtype=complex)[:, :, None]
-    scales = alone * near.slopes.gains[None]
-    return jnp.concatenate([circuits[:, None] * near.slopes.by_z[None], scales])
-
-
-def by_instrument(load: Load, near: Near) -> Complex[Array, "2 output knot"]:
-    """Derivatives of the gains with respect to crosstalk and capacitance of the instrument."""
+@array_function
+def changes(load: Load, near: Near) -> dict[str, Complex[Array, "change output knot"]]:
+    """Derivatives of the gains with respect to each of the changes that a fit tests for."""
     slopes, at = near.slopes, load.gains.at(load.knots)
-    first = np.eye(load.gains.outputs, dtype=complex)[0][:, None]
-    crosstalk = first * at.turned(near.q, jnp.ones_like(slopes.gains), at.frequency)
-    by_capacitance = -frequency_variable(at.frequency) * slopes.z * slopes.z
-    return jnp.stack([crosstalk, by_capacitance[None] * slopes.by_z])
-
-
-def by_layer(load: Load, near: Near) -> Complex[Array, "1 output knot"]:
-    """Derivatives of the gains with respect to a layer of diffusion in place of the circuit."""
-    frequency = load.knots.at(load.gains.frequency)
-    change = other_circuit.layer(load.gains.impedance(near.q), frequency)
-    return (change[None] * near.slopes.by_z)[None]
+    turn = at.turned(near.q, jnp.ones_like(slopes.gains), at.frequency)
+    current = slopes.gains[0] * jnp.conj(turn[0]) * reciprocal(slopes.z)
+    by_source = -current * slopes.gains * (0.0 if load.gains.driver.by_current else 1.0)
+    circuit = load.gains.circuit.with_log_values(load.gains.split(near.q)[0])
+    each = slopes.gains, slopes.by_z, by_source, turn, circuit.response
+    place = At(at.frequency, slopes.z, *each, bool(circuit.exponents()))
+    return {name: DIRECTIONS[name].change(place) for name in scored()}
 
 
 def by_falling(load: Load, near: Near) -> Complex[Array, "output harmonic"]:

@@ -11,30 +11,29 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.directions import ON_LOADS, SEEN
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import judged, unless
-from etid.estimators.maximum_likelihood.calibrations import FAULTS, Calibrations
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.condensed import Near, means
 from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import around
 from etid.estimators.maximum_likelihood.load import (
     Load,
     by_falling,
-    by_instrument,
-    by_layer,
     changes,
 )
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import best_start, minimum
 from etid.estimators.sandwich import Linear
-from etid.estimators.score_tests import SEEN, falling_resistance, other_circuit
+from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
-from etid.likelihood.fit import FAR, NO_HUM, UNSEEN
+from etid.likelihood.fit import FAR, FAULTS, NO_HUM, UNSEEN
 from etid.results.driver import HarmonicDriver
 from etid.results.fit import Fit, Support
-from etid.results.instrument import BUDGETED, Effects
+from etid.results.instrument import BUDGETED, LATER, Effects, Instrument
 from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, combined, power
@@ -89,29 +88,21 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     used = records.selected[0, every.index]
     moved = jnp.sqrt(jnp.max(jnp.where(used, power(load.gains.at(every).w(z)), 0.0)))
     fitted = _fitted(load, at, information)
-    tested = changes(load, near)
-    every_change = [by_instrument(load, near), by_layer(load, near), tested]
-    of_instrument, rows = jnp.split(condensed.rows(jnp.concatenate(every_change)), [2])
+    changed = changes(load, near)
+    rows = condensed.rows(jnp.concatenate(list(changed.values())))
     found = other_circuit.scores(rows, linear, condensed.part, fitted)
-    outputs = load.gains.outputs
-    of_layer, of_circuit, of_scales = (
-        jax.tree.map(lambda leaf, which=which: leaf[which], found)
-        for which in (0, slice(1, 1 - outputs or None), slice(-outputs, None))
-    )
-    other = other_circuit.Scores.of(of_circuit)
+    other = other_circuit.Scores.of(found, load.gains.outputs - 1)
+    gain, layer = other.of_one("gain"), other.of_one("layer")
     added = by_falling(load, near)
     falling = falling_resistance.score(added, near, every, share, noise, fitted)
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
-    of_gain = -outputs
-    direct = jnp.concatenate([rows[of_gain][None], of_instrument])
-    direct = linear.told(direct) @ information
-    others = direct[0]
+    direct = jnp.stack([other.of_one(name).others for name in ON_LOADS])
+    others = gain.others
     slopes = near.by_unknown(near.slopes)
     made = combined(others, slopes.reshape(at.size, -1)).reshape(slopes.shape[1:])
-    explained = (as_complex(-found.size[of_gain]) * profile.x)[None, :] * every.between(
-        tested[of_gain] - made
-    )
-    wrong_gain = (jnp.abs(found.z[of_gain]) > NO_HUM) & ~profile.shows_hum(
+    explained = (as_complex(-gain.size) * profile.x)[None, :]
+    explained = explained * every.between(changed["gain"][0] - made)
+    wrong_gain = (jnp.abs(gain.z) > NO_HUM) & ~profile.shows_hum(
         records, profile.whitened(explained)
     )
     of_own = (elements[:, :owned] * prior[None, :owned]) @ elements[:, :owned].T
@@ -149,12 +140,12 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
             squares + strain + beside - 2 * least.promised,
             terms,
             other.relevant(),
-            *other.spread.possible(),
-            of_layer.would_show(load.gains.circuit.scaling()[0]),
+            *other.of_one("spread").possible(),
+            layer.would_show(load.gains.circuit.scaling()[0]),
         ),
     )
     wrong = other.misfit | falling.seen()
-    contradicts = of_scales.contradicts()[1:].any()
+    contradicts = other.inconsistent
     width = load.gains.widths(at)[count]  # of the prior of the delay of V_out
     contradicts |= beyond(late[0] / width, information[count, count] / width**2)
     if driver.errors is not None and driver.errors.told is not None:
@@ -183,8 +174,10 @@ def _effects(
     moved = (elements @ (errors.by_z + errors.unstated)).T
     moved = moved.at[:FAULTS].add(-errors.direct[:, None] * direct[:, : gains.elements])
     drift = jnp.sqrt(jnp.sum((elements @ errors.drift) ** 2, axis=1))
-    later = jnp.stack([drift, BUDGETED["later gain"] * direct[0, : gains.elements]])
-    return Effects.of_errors(moved, errors.told, later)
+    of_gain = direct[ON_LOADS.index("gain"), : gains.elements]
+    of = {"drift": drift, "later gain": BUDGETED["later gain"] * of_gain}
+    stated = (errors.told or Instrument()).budgeted()
+    return Effects.of_errors(moved, jnp.stack([of[name] for name in LATER]), stated)
 
 
 def inverse_information(load: Load, near: Near) -> Float[Array, "q q"]:
@@ -220,11 +213,10 @@ def scores_at(load: Load, q: Float[Array, " q"]) -> other_circuit.Scores:
     """What a load shows of another circuit or gain; q need not be at a minimum."""
     near = load.near(q)
     linear, _ = _linear(load, near, near.profile.excess(load.known(q)))
-    scales_of_currents = load.gains.outputs - 1
-    tested = changes(load, near)
-    rows = near.condensed.rows(tested[: len(tested) - scales_of_currents])
-    fitted = _fitted(load, near.q, linear.bread())
-    return other_circuit.Scores.of(other_circuit.scores(rows, linear, near.condensed.part, fitted))
+    changed, fitted = changes(load, near), _fitted(load, near.q, linear.bread())
+    rows = near.condensed.rows(jnp.concatenate(list(changed.values())))
+    found = other_circuit.scores(rows, linear, near.condensed.part, fitted)
+    return other_circuit.Scores.of(found, load.gains.outputs - 1)
 
 
 def _fitted(

@@ -24,7 +24,7 @@ from etid.likelihood.unloaded import differs
 from etid.numpy_tier.algebra import one_thread
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
-from etid.results.instrument import BUDGETED
+from etid.results.instrument import Instrument
 from etid.signals.harmonics import same_unloaded
 
 ROWS = 16  # recordings side by side: their arrays stay in the cache of a processor
@@ -35,8 +35,7 @@ def source_of(known: GivenDriver) -> Source:
     known = jax.tree.map(np.asarray, known)
     errors, tolerances, of = None, None, known.errors
     if of is not None:
-        told = [getattr(of.told, name, None) for name in BUDGETED]
-        stated = np.array([0.0 if one is None else float(one) for one in told])
+        stated = np.asarray((of.told or Instrument()).budgeted())
         errors = Errors(of.at, of.by_z, of.unstated, of.direct, of.drift, stated)
     if known.faults is not None and of is not None:
         tolerances = Tolerances(*known.faults, known.bend, of.at[-1], of.by_z[:, -1])

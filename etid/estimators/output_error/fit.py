@@ -25,6 +25,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.directions import DIRECTIONS
 from etid.circuits.elements import resistor
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import (
@@ -53,7 +54,7 @@ from etid.estimators.score_tests.other_in_time import EXACT, Shown, bends, relax
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
 from etid.results.feed import CurrentSource, MeasuredCurrent, loaded
-from etid.results.fit import CHANGES, Support, rrse
+from etid.results.fit import Support, rrse
 from etid.signals.filtering import CUTOFF, StateSpace
 from etid.signals.transfer import Rational
 from etid.solvers.least_squares import least_squares
@@ -303,7 +304,8 @@ def fit_circuit(
     mean = jnp.sum(seen * records.used) / records.intervals
     cov = cov * jnp.maximum(chi2, 1.0) + shared
     error = rrse(jnp.where(used, predicted, mean), jnp.where(used, seen, mean))
-    shown = Shown(found.relaxes(), jnp.zeros((), bool))
+    relaxes = jnp.any(DIRECTIONS["relaxation"].seen(*found[:3]))
+    shown = Shown(relaxes, jnp.zeros((), bool))
     if behind_current:
         least = EXACT * jnp.sqrt(records.intervals) / error
         shown = Shown.behind_current(found, jnp.sqrt(jnp.diagonal(cov)), chi2, least)
@@ -332,7 +334,7 @@ def _support(objective: Float[Array, ""], records: Records, elements: int) -> Su
     return Support(
         2 * objective * free,
         records.intervals * free,
-        jnp.zeros(CHANGES),
+        jnp.zeros(Support.changes()),
         nothing,
         jnp.zeros(elements),
         jnp.asarray(jnp.nan),

@@ -5,6 +5,3 @@ Each test uses the residuals of a finished fit. No test fits again.
 Each test is asked of every recording of a study, which may have 10⁶ of them. A study can bear that
 one good recording in 10 000 is refused by one test: less than other faults of a laboratory refuse.
 """
-
-FALSE_ALARMS = 1e-4  # probability that chance exceeds the limit of one test
-SEEN = 3.9  # standard deviations; a normal number exceeds it with this probability

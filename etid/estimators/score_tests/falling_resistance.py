@@ -15,17 +15,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid.circuits.directions import DIRECTIONS
 from etid.estimators.maximum_likelihood.condensed import Near
-from etid.estimators.score_tests import SEEN
-from etid.estimators.score_tests.other_circuit import MOVED, Fitted
-from etid.likelihood.directions import FINE, HARMONICS
+from etid.estimators.score_tests.other_circuit import Fitted
 from etid.likelihood.fit import SHARE, UNSURE
+from etid.likelihood.scores import FINE, HARMONICS
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, power, reciprocal
 
 NO_FALL = (  # for a methods section
     "a score test finds no resistance of the load that falls with its current (at most "
-    f"{SEEN:g} standard deviations)"
+    f"{DIRECTIONS['falling'].limit:.2g} standard deviations)"
 )
 
 
@@ -44,7 +44,8 @@ class Falling(NamedTuple):
 
     def seen(self) -> Bool[Array, ""]:
         """Whether the resistance falls, and the fall moves an element."""
-        return (self.z > SEEN) & (self.moved > MOVED)
+        row = DIRECTIONS["falling"]
+        return (self.z > row.limit) & (self.moved > row.moves)
 
     def causes(
         self, squares: Float[Array, ""], terms: Float[Array, ""], others: Float[Array, " change"]

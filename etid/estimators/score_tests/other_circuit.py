@@ -1,105 +1,32 @@
 """Score tests whether a load is another circuit than the fitted one.
 
-Let Z be the fitted impedance, and r the residual in standard deviations. Rao's score test checks
-whether r correlates with a change of Z that the circuit cannot make. Let d be the derivative of r
-with respect to the size ε of the change, with the effect of the other parameters projected out. If
-the circuit is right, z = d·r / σ(d·r) is normal. The test detects changes that χ² over all
-harmonics does not show. There are two kinds of change.
-
-**A relaxation that is spread over time constants.** The most common model of skin that is not one
-RC is that of Cole (1940). It replaces jω by (jω)^α; α = 1 is the circuit itself:
-
-    ∂Z/∂α = s ln s dZ/ds.
-
-At 40 dB, α = 0.9 changes R_s by a quarter of its value; χ² is 1.1 and z above 10. A circuit with
-its own α can make this change itself. For such a circuit the test checks whether the spread is
-symmetric. Cole's spread is symmetric; that of Davidson and Cole (1951) is not. ln s becomes
-ln s + ε ln² (s/s₀) around the middle s₀ of the band, and
-
-    ∂Z/∂ε = s ln² (s/s₀) dZ/ds.
-
-**One more relaxation**, ΔZ = ε |Z(j/τ)| / (1 + sτ), for each τ of a grid that exceeds the band.
-This test also has power if dZ/ds = 0, as for a resistor. A change that the circuit can make itself
-is no evidence: d vanishes. An example is a relaxation with a τ that the circuit has already.
-
-The same score also tests for another gain of V_out, which is no change of the circuit. Most gains
-of 1 % are not seen at 40 dB, and would change R_p of dry skin by 14 %. What the score shows of a
-gain without proving it goes into the standard errors.
+`etid.circuits.directions` has the changes, and `etid.likelihood.scores` the statistics.
 """
 
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Float
 
-from etid.circuits.impedance import AbstractImpedance
+from etid.circuits.directions import DIRECTIONS, named, scored
 from etid.estimators.sandwich import Linear
-from etid.estimators.score_tests import SEEN
-from etid.likelihood.fit import DOUBTED, GAIN, MOVED, SCALE, SEEN_RELAXATION, SPREAD
-from etid.signals.transfer import AnyArray, as_complex, combined, frequency_variable
+from etid.likelihood.fit import DOUBTED, GAIN
+from etid.signals.transfer import AnyArray
 
 # For a methods section.
 NO_OTHER_CIRCUIT = (
     "score tests find no relaxation of the load that is spread over time constants (at most "
-    f"{SEEN:g} standard deviations) and no further relaxation (at most {SEEN_RELAXATION:g})"
+    f"{DIRECTIONS['spread'].limit:.2g} standard deviations) and no further relaxation (at most "
+    f"{DIRECTIONS['relaxation'].limit:.2g})"
 )
 NO_OTHER_GAIN = (
     "a score test finds no difference between the gains of the two records (at most "
-    f"{SEEN:g} standard deviations)"
+    f"{DIRECTIONS['gain'].limit:.2g} standard deviations)"
 )
-GRID = 7  # time constants, two per decade; a relaxation is wider than that
-BEYOND = 2.0  # factor by which they exceed the band
-# Faster relaxations of a layer of diffusion, by √(τ₁/τ). The rest adds 3 % of R_p to R_s.
-FASTER = np.arange(3.0, 17.0, 2.0)
 NOTHING = 1e-9  # of the power of a change; rounding leaves less of one that the circuit can make
-
-
-def changes(
-    impedance: AbstractImpedance, frequency: Float[Array, " harmonic"]
-) -> tuple[Complex[Array, " harmonic"], Complex[Array, "change harmonic"]]:
-    """Z and ∂Z/∂ε [Ω] of all changes at real frequencies [Hz]; the first is the spread."""
-    z, by_spread = spread(impedance, frequency)
-    corner, level = relaxations(impedance, frequency[0], frequency[-1])
-    x = frequency_variable(frequency).imag[None, :] * (1 / corner)[:, None]
-    real = level[:, None] / (1 + x**2)
-    return z, jnp.concatenate([by_spread[None, :], jax.lax.complex(real, -x * real)])
-
-
-def spread(
-    impedance: AbstractImpedance, frequency: Float[Array, " harmonic"]
-) -> tuple[Complex[Array, " harmonic"], Complex[Array, " harmonic"]]:
-    """Z, and ∂Z/∂α, or ∂Z/∂ε of a circuit that has an α [Ω]."""
-    s = frequency_variable(frequency)
-    log_s = jax.lax.complex(jnp.log(s.imag), jnp.full_like(frequency, jnp.pi / 2))
-    if impedance.exponents():
-        log_s = log_s - as_complex((log_s.real[0] + log_s.real[-1]) / 2)
-        log_s = log_s * log_s
-    return jax.jvp(impedance, (s,), (s * log_s,))
-
-
-def relaxations(
-    impedance: AbstractImpedance, lowest: Float[Array, ""], highest: Float[Array, ""]
-) -> tuple[Float[Array, " relaxation"], Float[Array, " relaxation"]]:
-    """1/τ [rad/s] and |Z(j/τ)| [Ω] of the relaxations for a band [Hz]."""
-    corner = 2 * jnp.pi * jnp.geomspace(lowest / BEYOND, highest * BEYOND, GRID)
-    return corner, jnp.abs(impedance(jax.lax.complex(jnp.zeros_like(corner), corner)))
-
-
-def layer(
-    impedance: AbstractImpedance, frequency: Float[Array, " harmonic"]
-) -> Complex[Array, " harmonic"]:
-    """∂Z/∂ε [Ω] that turns, at ε = 1, each relaxation into a layer through which charge diffuses.
-
-    Such a layer, tanh √(sτ) / √(sτ), is a slow relaxation, a ninth of it that is nine times as
-    fast, a 25th of it that is 25 times as fast, and so on. With Z(0) as it is,
-
-        ∂Z/∂ε = Σ (Z(s/n²) − Z(s)) / n² / (1 + Σ 1/n²),      n = 3, 5, 7, …
-    """
-    s, shares = frequency_variable(frequency), jnp.asarray(FASTER**-2)
-    faster = impedance(as_complex(shares)[:, None] * s[None, :]) - impedance(s)[None, :]
-    return combined(shares / (1 + shares.sum()), faster)
 
 
 class Score(NamedTuple):
@@ -111,6 +38,7 @@ class Score(NamedTuple):
         moved: Largest change of the logarithm of an element by this ε.
         stderr: Standard error of ε.
         slope: Change of the logarithm of each element for each unit of ε.
+        others: What the parameters do of the change.
     """
 
     z: Float[Array, "*change"]
@@ -118,20 +46,13 @@ class Score(NamedTuple):
     moved: Float[Array, "*change"]
     stderr: Float[Array, "*change"]
     slope: Float[Array, "*change element"]
-
-    def exceeds(self, limit: float) -> Bool[Array, "*change"]:
-        """Whether z exceeds this limit and the change moves an element."""
-        return (jnp.abs(self.z) > limit) & (self.moved > MOVED)
-
-    def relevant(self) -> Float[Array, "*change"]:
-        """z; 0 if the change moves no element or if the circuit can make it itself."""
-        return jnp.where(self.moved > MOVED, jnp.nan_to_num(self.z), 0.0)
+    others: Float[Array, "*change q"]
 
     def possible(self) -> tuple[Float[Array, "*change"], Float[Array, "*change element"]]:
         """Standard errors of ε, and slopes of the elements; 0 if the circuit makes the change."""
-        tested = jnp.isfinite(self.z) & jnp.isfinite(self.stderr)
-        stderr = jnp.where(tested, self.stderr, 0.0)
-        return stderr, jnp.where(tested[..., None], self.slope, 0.0)
+        finite = jnp.isfinite(self.z) & jnp.isfinite(self.stderr)
+        stderr = jnp.where(finite, self.stderr, 0.0)
+        return stderr, jnp.where(finite[..., None], self.slope, 0.0)
 
     def would_show(self, powers: Float[AnyArray, " element"]) -> Float[Array, ""]:
         """Standard deviations of one change with ε = 1, if no element would be negative then.
@@ -156,61 +77,58 @@ class Score(NamedTuple):
         moved = jnp.where(likely, mean, 0.0) * self.slope
         return likely, jnp.outer(moved, moved)
 
-    def contradicts(self) -> Bool[Array, "*change"]:
-        """Whether the scale of a measured current is wrong; all changes must be such scales."""
-        return (jnp.abs(self.z) > SEEN) & (self.moved > SCALE)
-
-    def relaxes(self) -> Bool[Array, ""]:
-        """Whether one more relaxation is seen; all changes must be relaxations."""
-        return jnp.any(self.exceeds(SEEN_RELAXATION))
-
 
 class Scores(NamedTuple):
     """Scores of all changes for one residual.
 
     Attributes:
-        spread: Score of the spread.
-        relaxation: Scores of one more relaxation, for each time constant.
-        gain: Score of the gain of V_out.
+        each: Scores of each of `scored`.
     """
 
-    spread: Score
-    relaxation: Score
-    gain: Score
+    each: Mapping[str, Score]
 
     @classmethod
-    def of(cls, scores: Score) -> "Scores":
-        """Name the scores of all `changes`, which that of a gain follows."""
+    def of(cls, scores: Score, currents: int) -> "Scores":
+        """Name the scores of `scored`, in their order, with so many scales of currents."""
+        counts = [currents if DIRECTIONS[n].of_others else DIRECTIONS[n].count for n in scored()]
+        ends = np.cumsum(counts).tolist()
+        places = zip(scored(), map(slice, [0, *ends[:-1]], ends), strict=True)
+        return cls({n: jax.tree.map(lambda leaf, at=at: leaf[at], scores) for n, at in places})
 
-        def part(which: int | slice) -> Score:
-            return jax.tree.map(lambda leaf: leaf[which], scores)
+    def of_one(self, name: str) -> Score:
+        """The score of a change of which there is one."""
+        return jax.tree.map(lambda leaf: leaf[0], self.each[name])
 
-        return cls(part(0), part(slice(1, -1)), part(-1))
+    def _seen(self, names: Iterable[str]) -> Bool[Array, ""]:
+        each = [DIRECTIONS[name].seen(*self.each[name][:3]) for name in names]
+        return jnp.any(jnp.concatenate(each))
 
     def seen(self) -> Bool[Array, ""]:
         """Whether the scores show another circuit."""
-        spread = (jnp.abs(self.spread.z) > SEEN) & (jnp.abs(self.spread.size) > SPREAD)
-        return spread | self.relaxation.relaxes()
+        return self._seen(n for n in self._of("misfit") if DIRECTIONS[n].of_circuit)
 
     def relevant(self) -> Float[Array, " change"]:
-        """Z of all changes; 0 if a change is too small to matter."""
-        spread = jnp.where(jnp.abs(self.spread.size) > SPREAD, self.spread.z, 0.0)
-        parts = jnp.nan_to_num(spread), self.relaxation.relevant(), self.gain.relevant()
-        return jnp.concatenate([jnp.atleast_1d(part) for part in parts])
+        """Z of all changes that have a name; 0 if a change is too small to matter."""
+        each = [DIRECTIONS[name].relevant(*self.each[name][:3]) for name in named()]
+        return jnp.concatenate(each)
 
-    def has_other_gain(self) -> Bool[Array, ""]:
-        """Whether the score shows that V_out and V_th have different gains."""
-        return self.gain.exceeds(SEEN)
+    def _of(self, verdict: str) -> list[str]:
+        return [name for name in self.each if DIRECTIONS[name].verdict == verdict]
 
     @property
     def misfit(self) -> Bool[Array, ""]:
-        """Whether the scores show another circuit or another gain of V_out."""
-        return self.seen() | self.has_other_gain()
+        """Whether the scores show another circuit, or a fault of V_out."""
+        return self._seen(self._of("misfit"))
+
+    @property
+    def inconsistent(self) -> Bool[Array, ""]:
+        """Whether the scale of a measured current is wrong."""
+        return self._seen(self._of("inconsistent"))
 
     def doubt(self) -> tuple[Bool[Array, ""], Float[Array, "element element"]]:
         """`Score.doubt` of the gain; none if it is proven, for then the fit is a misfit."""
-        likely, cov = self.gain.doubt()
-        proven = self.has_other_gain()
+        likely, cov = self.of_one("gain").doubt()
+        proven = self._seen(["gain"])
         return likely & ~proven, jnp.where(proven, 0.0, cov)
 
 
@@ -260,4 +178,4 @@ def scores(
     moved = jnp.abs(size) * jnp.max(jnp.abs(slope), axis=1)
     deviation = jnp.sqrt(variance)
     z = jnp.where(can, jnp.nan, score / deviation)
-    return Score(z, size, moved, deviation / curvature, slope)
+    return Score(z, size, moved, deviation / curvature, slope, others)

@@ -35,6 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid.circuits.directions import SEEN, relaxations
 from etid.circuits.impedance import AbstractImpedance, realise
 from etid.estimators.output_error.information import Slopes, bin_weights, noise_power, padded_size
 from etid.estimators.output_error.prediction import (
@@ -48,13 +49,12 @@ from etid.estimators.output_error.prediction import (
     residual_variance,
 )
 from etid.estimators.sandwich import Linear
-from etid.estimators.score_tests import SEEN
-from etid.estimators.score_tests.other_circuit import Fitted, Score, relaxations, scores
+from etid.estimators.score_tests.other_circuit import Fitted, Score, scores
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance
 from etid.results.feed import CurrentSource
 from etid.signals.filtering import CUTOFF, StateSpace, hold, simulate
-from etid.signals.transfer import as_complex
+from etid.signals.transfer import as_complex, frequency_variable
 from etid.solvers.matrices import inverse
 
 # [Hz] Faster relaxations resemble delays and the fast poles of the driver. At 40 dB these poles are
@@ -84,8 +84,9 @@ def relaxed(
     """Derivatives with respect to one more relaxation, for each time constant."""
     rate, load = records.sample_rate, _in_time(records, impedance)
     highest = CUTOFF * rate if isinstance(source, CurrentSource) else jnp.asarray(HIGHEST)
-    corner, level = relaxations(impedance, rate / records.intervals, highest)
-    count = corner.size
+    band = jnp.stack([rate / records.intervals, highest])
+    corner, level = relaxations(lambda f: impedance(frequency_variable(f)), band[:1], band[1:])
+    corner, count = 2 * np.pi * corner, corner.size
     A = jax.scipy.linalg.block_diag(load.A, -jnp.diag(corner))
     B = jnp.concatenate([load.B, corner[:, None]])
     state = jnp.concatenate([nuisance.state, jnp.zeros(count)])
