@@ -7,7 +7,8 @@ import etid
 from etid.estimators.lanes import Harmonics, PaddedSamples
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
-from etid.signals.pulse_train import find_pulses, lags_of, whole_lag
+from etid.signals.lags import lags_of, whole_lag
+from etid.signals.pulse_train import find_pulses
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from tests.skins import DAMP, DRY, off

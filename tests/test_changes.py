@@ -11,8 +11,9 @@ from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.circuits.directions import FALSE_ALARMS
 from etid.identify import changes
 from etid.recordings.preflight import Inspected
-from etid.recordings.repeats import _noise_of_single, repeats
+from etid.recordings.repeats import repeats
 from etid.results.fits import Fits
+from etid.signals.deviations import _noise_of_single
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import TransformerDriver
 from tests import pictures

@@ -139,7 +139,7 @@ def test_the_window_leaves_the_quiet_parts_of_each_period(loud):
     samples, periods = 3 * 3840, 3  # 30 samples of each part
     parts = np.zeros((1, BLOCKS), bool)
     parts[:, loud] = True
-    (window,) = window_of(parts, periods, samples).reshape(1, periods, -1)
+    window = window_of(parts, periods, samples)[0].reshape(periods, -1)
     np.testing.assert_allclose(window[1:], window[[0]].repeat(2, axis=0), atol=1e-12)
     away = np.abs(np.subtract.outer(np.arange(BLOCKS), loud))
     away = np.minimum(away, BLOCKS - away).min(1).repeat(30)

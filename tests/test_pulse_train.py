@@ -8,7 +8,9 @@ import etid
 from etid.identify.planning import explained
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
-from etid.signals.pulse_train import clocks_apart, fast_length, find_pulses
+from etid.signals.drift import clocks_apart
+from etid.signals.periods import fast_length
+from etid.signals.pulse_train import find_pulses
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import SkinLoad
 

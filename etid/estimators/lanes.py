@@ -23,8 +23,8 @@ from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
 from etid.signals.harmonics import ALIASED, Spectrum, aliases, filled, harmonics, joins_aliases
+from etid.signals.lags import rest, shifted
 from etid.signals.noise import Measurement, noise_of
-from etid.signals.pulse_train import rest, shifted
 from etid.signals.rounding import rounding_variance
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide

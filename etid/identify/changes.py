@@ -30,11 +30,12 @@ from jaxtyping import Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, with_slopes
 from etid.circuits.directions import FALSE_ALARMS
-from etid.recordings.repeats import ALIGNED, Repeats
+from etid.recordings.repeats import Repeats
 from etid.results.driver import Driver
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.verdicts import verdict
+from etid.signals.deviations import ALIGNED
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import reciprocal
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from etid.circuits.display import rounded, several
 from etid.recordings.preflight import Inspected
-from etid.signals.pulse_train import lags_of, shifted, whole_lag
+from etid.signals.lags import lags_of, shifted, whole_lag
 
 LOG = logging.getLogger("etid")
 

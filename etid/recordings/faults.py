@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from etid.signals.clipping import is_clipped, is_command, is_limited, may_be_clipped, may_be_limited
-from etid.signals.pulse_train import shifted, whole_lag
+from etid.signals.lags import shifted, whole_lag
 
 SEAM = 3  # samples on each side of the joint between two periods
 BY_CHANCE = 4.0  # [standard deviations] largest difference that noise makes

@@ -20,23 +20,18 @@ from etid.signals.averaging import (
     weights,
 )
 from etid.signals.disturbances import Joint, Shifts, disturbed, kept
+from etid.signals.drift import clocks_apart, largest_drift
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import (
     filled,
     harmonics,
     whole_periods,
 )
+from etid.signals.lags import lags_of
 from etid.signals.mains import Hum, separated
 from etid.signals.noise import Noise, floor, noise_of
 from etid.signals.periods import Periods
-from etid.signals.pulse_train import (
-    PulseTrain,
-    clocks_apart,
-    lags_of,
-    largest_drift,
-    pulse_trains,
-    rise_time,
-)
+from etid.signals.pulse_train import PulseTrain, pulse_trains, rise_time
 from etid.signals.quick_looks import humming, shows_few, uneven
 from etid.signals.rounding import VISIBLE, is_coarse, step_of
 
@@ -201,12 +196,12 @@ class Group:
         """Covariance of both voltages in `quiet` [V²]."""
         return covariance_of(self.quiet)
 
-    @property
+    @functools.cached_property
     def kept(self) -> list[Joint | None]:
         """The periods in use if some are left out or aligned; None if all are used as they are."""
         return [kept for kept, _ in self._periods]
 
-    @property
+    @functools.cached_property
     def shifts(self) -> list[Shifts | None]:
         """The shifts of the periods of `v_out` against those of `v_th`; None if there are none."""
         return [found for _, found in self._periods]
@@ -306,6 +301,11 @@ class Group:
         least = floor(self.limits, self.step)[..., None] ** 2 / self._shown[1]
         return noise._replace(power=np.maximum(noise.power, least))
 
+    @functools.cached_property
+    def variance(self) -> Float[np.ndarray, "recording 2 harmonic"]:
+        """`Noise.variance` of `noise_of_quiet`."""
+        return np.asarray(self.noise_of_quiet.variance)
+
     @quietly()
     def cut(self, which: int) -> Periods:
         """The periods of `v_th` or of `v_out` in `quiet`, cut where the counted rate says."""
@@ -346,7 +346,7 @@ class Group:
         periods, samples = self.periods
         found = np.asarray(harmonics(self.quiet, periods, samples))
         noise = self.noise_of_quiet
-        power = np.array(noise.variance)
+        power = self.variance.copy()
         differing = differing_aliases(
             found, power, self.periods, self.counted_spacing, self._rests, self.cut
         )
@@ -393,7 +393,7 @@ def _saturated(group: Group, rows: _Rows) -> _Holds:
     found = faults.saturated(records, limits, step, adc_range)
     if group.has_current:
         found[:, 0] &= ~faults.held(sigma[:, 0], step[:, 0], group.spans[rows, 0])
-        return found.any(1)  # a stimulator that holds its voltage is no fault
+        return np.asarray(found.any(1))  # a stimulator that holds its voltage is no fault
     unit = np.maximum(np.maximum(sigma, step), group.coarse[rows])[:, 1]
     of = limits[:, 1], unit, group.lags[rows], group.sample_rate
     return found.any(1) | faults.limited(records, *of)

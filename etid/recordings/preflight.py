@@ -15,9 +15,10 @@ from etid.recordings.remarks import Remark
 from etid.signals.averaging import Aliases, exact_spacing
 from etid.signals.disturbances import Joint, Shifts
 from etid.signals.harmonics import ALIASED, aliases, have_ended, joins_aliases
+from etid.signals.lags import shifted, whole_lag
 from etid.signals.mains import Hum
 from etid.signals.noise import Noise
-from etid.signals.pulse_train import PulseTrain, shifted, whole_lag
+from etid.signals.pulse_train import PulseTrain
 
 
 def _recorded(name: str) -> Any:

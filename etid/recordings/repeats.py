@@ -24,7 +24,6 @@ fs + f, which rotate by e^(j2πδ), and those of twice the sample rate have dire
 weighted as if they were noise: by (1 + Σ ρ t tᴴ)⁻¹, ρ = n A²/σ² in a band of n harmonics.
 """
 
-import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -35,17 +34,22 @@ from jaxtyping import Bool, Complex, Float, Int
 from etid.recordings.group import Group
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import quietly
+from etid.signals.deviations import (
+    PLAIN,
+    SURE,
+    TINY,
+    Bands,
+    Deviations,
+    bands,
+    deviations_of,
+    rotations,
+    smoothed,
+)
 from etid.signals.harmonics import aliases
-from etid.signals.periods import Periods, length_of, turns
-from etid.signals.pulse_train import fast_length
+from etid.signals.periods import Periods, turns
+from etid.signals.transfer import power as power_of
 
-# Relative to the sample rate. Below it, bands share one estimate of their noise. Above it, aliases
-# can exceed the noise; each band then has its own.
-PLAIN = 0.25
 ALIASES = 0.03  # of the sample rate; above, a change is not told from aliases
-ALIGNED = 1e-3  # [samples] a smaller delay changes the gain in proportion
-TINY = 1e-30  # replaces the power of a record of zeros
-SURE = 5.0  # [standard deviations] the noise of a band must exceed that of all bands by this
 
 
 class Repeats(NamedTuple):
@@ -78,52 +82,6 @@ class Repeats(NamedTuple):
     removed: Complex[np.ndarray, "*lane band direction direction"]
     unloaded: Float[np.ndarray, "*lane period"]
     unloaded_variance: Float[np.ndarray, "*lane"]
-
-
-class Bands(NamedTuple):
-    """Bands of frequency of records with equal sample rates and pulse rates.
-
-    Attributes:
-        length: Number of samples of a period that are used.
-        size: Number of samples after zero padding, chosen for a fast transform.
-        edges: First harmonic of each band, counted from 0.
-        number: Number of harmonics in each band.
-        middle: Centre of each band [radian per sample].
-        polynomials: Transforms of polynomials at the harmonics. As real vectors of real and
-            imaginary parts they are orthonormal.
-    """
-
-    length: int
-    size: int
-    edges: np.ndarray
-    number: np.ndarray
-    middle: np.ndarray
-    polynomials: np.ndarray
-
-
-@functools.lru_cache(maxsize=16)
-def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
-    """Bands for a nominal pulse rate, up to `band` times the sample rate.
-
-    Each of the twelve lowest harmonics is a band. Above them the edges of the bands have a ratio of
-    1.08. The polynomials have a degree of 6, which describes 0.994 of the 0.83 turns of 50 Hz hum.
-    The measured pulse rate may differ from the nominal one.
-    """
-    length = length_of(sample_rate / pulse_rate)
-    size = fast_length(length)
-    count = int(band * size)
-    edges, ratio = [*range(min(12, count))], 1.08
-    while edges and edges[-1] * ratio + 1 < count:
-        edges.append(int(np.ceil(edges[-1] * ratio + 1e-9)))
-    edges = np.array(edges)
-    number = np.diff([*edges, count])
-    middle = 2 * np.pi * (edges + 1 + (number - 1) / 2) / size
-    time = np.linspace(-1, 1, length)
-    transforms = np.fft.rfft(np.polynomial.legendre.legvander(time, 6), size, axis=0)[1 : count + 1]
-    joined = np.linalg.qr(np.concatenate([transforms.real, transforms.imag]))[0].T
-    polynomials = joined[:, :count] + 1j * joined[:, count:]
-    polynomials = polynomials.astype(np.complex64, order="C")
-    return Bands(length, size, edges, number, middle, polynomials)
 
 
 @quietly()
@@ -162,7 +120,7 @@ def repeats(inspected: Sequence[Inspected]) -> list[Repeats | None]:
 def _differ(of: Repeats) -> bool:
     """Whether the periods differ by more than noise explains, in bands without aliases."""
     plain = of.frequency < PLAIN * of.sample_rate
-    square = (_power(of.gain) / of.variance)[:, plain].sum()
+    square = (power_of(of.gain) / of.variance)[:, plain].sum()
     freedom = 2 * (len(of.gain) - 1) * np.count_nonzero(plain)
     return bool(square > freedom + SURE * math.sqrt(2 * freedom))
 
@@ -197,7 +155,7 @@ class _Rows(NamedTuple):
 
     def noise(self, record: int) -> Float[np.ndarray, "lane band"]:
         """Variance of the real part of a harmonic of one period, of one of the records."""
-        variance = self.in_bands(np.asarray(self.group.noise_of_quiet.variance)[:, record])
+        variance = self.in_bands(self.group.variance[:, record])
         return variance * (self.group.periods[1] * self.layout.length / 2)
 
     def aliases(self) -> Bool[np.ndarray, "lane band"]:
@@ -209,7 +167,7 @@ class _Rows(NamedTuple):
         high = np.repeat(self.layout.middle[None] > 2 * np.pi * ALIASES, self.rows.size, axis=0)
         if self.group.has_current:
             return high
-        variance = np.asarray(self.group.noise_of_quiet.variance)[:, 1]
+        variance = self.group.variance[:, 1]
         y = self.group.spectra[2][:, : variance.shape[1]]
         ratio = np.asarray(aliases(y, variance, *self.group.periods).power / variance)
         return high | (self.in_bands(ratio) * self.layout.number > 0.1)
@@ -219,22 +177,22 @@ class _Rows(NamedTuple):
         records: Float[np.ndarray, "recording 2 time"],
         which: int,
         late: Int[np.ndarray, " lane"],
-    ) -> "_Deviations":
+    ) -> Deviations:
         """Deviations of the periods of one of the records, which may be late [samples]."""
-        group = self.group
+        group, count = self.group, self.layout.polynomials.shape[1]
         if records is group.quiet:
             found = group.cut(which).take(self.rows)
         else:
             found = self._cut(records[self.rows, which], self.at)
+        raw = found.each[..., 1 : count + 1].astype(np.complex64)
+        after = found.starts - self.at
         for lane in np.flatnonzero(late):
             # Else a late record would be cut within its pulses. The samples cut off at one end are
             # added at the other.
             v = np.roll(records[self.rows[lane], which, : group.periods[1]], -late[lane])
             own = self._cut(v[None], self.at[[lane]])
-            found.each[lane], found.starts[lane] = own.each[0], own.starts[0]
-        raw = found.each[..., 1 : self.layout.polynomials.shape[1] + 1].astype(np.complex64)
-        after = found.starts - self.at
-        return _deviations(raw, after, self.layout, self.noise(which), self.aliased)
+            raw[lane], after[lane] = own.each[0, :, 1 : count + 1], own.starts[0] - self.at[lane]
+        return deviations_of(raw, after, self.layout, self.noise(which), self.aliased)
 
     def _cut(
         self, v: Float[np.ndarray, "lane time"], at: Float[np.ndarray, "lane period"]
@@ -258,22 +216,22 @@ def _of_rows(
     # edges would look like another amplitude in each period: by 1e-3 if every fourth remains.
     low = of._replace(layout=bands(*rates, 1 / 32))
     unloaded = low.deviations(records, 0, 0 * late)
-    weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low.layout)
+    weight, smooth = 1 / unloaded.variance, smoothed(unloaded.mean, low.layout)
     # Effect of an amplitude change by 1 after the projection of the polynomials.
     unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power
-    total = (weight * _power(unit)).sum(1)
+    total = (weight * power_of(unit)).sum(1)
     along = np.real(unloaded.gain * (weight * np.conj(unit))[:, None, :]).sum(2)
     amplitude = along / total[:, None]
     # Coloured noise does not look like an amplitude change: the rest measures its size.
     rest = unloaded.gain - amplitude[:, :, None] * unit[:, None, :]
     periods = group.periods[0]
     freedom = (2 * low.layout.middle.size - 1) * (periods - 1)
-    noise = np.maximum(1.0, (weight[:, None, :] * _power(rest)).sum((1, 2)) / freedom)
+    noise = np.maximum(1.0, (weight[:, None, :] * power_of(rest)).sum((1, 2)) / freedom)
     width = _phases(records[rows, 0], group.limits[rows, 0]) / periods
     # Because cuts fall between samples, the amplitude differs by 1e-4 for 133 samples of a pulse,
     # by 0.03 for 8 samples.
     variance = noise / total + (2 / np.square(width)) ** 2
-    return _joined(of, own, _smooth(own.mean, of.layout), amplitude, variance)
+    return _joined(of, own, smoothed(own.mean, of.layout), amplitude, variance)
 
 
 def _directions(
@@ -283,7 +241,7 @@ def _directions(
     Complex[np.ndarray, "lane band direction direction"],
 ]:
     """`Repeats.turn` and `Repeats.removed` for cuts with these delays [samples]."""
-    turns, basis = _rotations(late)
+    turns, basis = rotations(late)
     count, layout, known = basis.shape[2], of.layout, of.aliased
     basis[~known, :, 1:] = 0
     removed = np.zeros((len(late), layout.middle.size, count, count), complex)
@@ -291,7 +249,7 @@ def _directions(
     if known.any():
         place = layout.middle / (2 * np.pi)
         y = of.group.differing.of_out.take(of.rows[known]).at(place)[:, :2]
-        noise = of.in_bands(np.asarray(of.group.noise_of_quiet.variance)[:, 1])[known]
+        noise = of.in_bands(of.group.variance[:, 1])[known]
         ratio = np.repeat(y * layout.number / (late.shape[1] * noise)[:, None], 2, axis=1)
         inside = basis[known].conj().swapaxes(1, 2) @ turns[known]
         of_aliases = np.einsum("rak,rkb,rck->rbac", inside, ratio, inside.conj())
@@ -299,21 +257,7 @@ def _directions(
     return basis.swapaxes(1, 2), removed
 
 
-def _rotations(
-    late: Float[np.ndarray, "lane period"],
-) -> tuple[Complex[np.ndarray, "lane period alias"], Complex[np.ndarray, "lane period direction"]]:
-    """How aliases rotate with these delays [samples], without the mean, and an orthonormal basis.
-
-    They are those of fs − f, fs + f, 2 fs − f and 2 fs + f.
-    """
-    turns = np.exp(-2j * np.pi * np.array([1, -1, 2, -2]) * late[:, :, None])
-    turns -= turns.mean(1, keepdims=True)
-    basis, by = np.linalg.qr(turns)
-    size = np.abs(np.diagonal(by, axis1=1, axis2=2))
-    return turns, np.where((size > ALIGNED)[:, None], basis, 0)
-
-
-def _of_currents(of: _Rows, own: "_Deviations", other: "_Deviations") -> Repeats:
+def _of_currents(of: _Rows, own: Deviations, other: Deviations) -> Repeats:
     """Deviations of the quotients of voltage and current."""
     pairs, layout = [], of.layout
     angle = own.late * (2 * np.pi / layout.size)
@@ -325,10 +269,10 @@ def _of_currents(of: _Rows, own: "_Deviations", other: "_Deviations") -> Repeats
         noise = np.repeat(one.variance * one.power / unit[:, None] ** 2, layout.number, axis=1)
         pairs.append((turned, turned.mean(1), noise))
     (y, y_mean, y_noise), (x, x_mean, x_noise) = pairs
-    white = 1 / np.sqrt(_power(x_mean) * y_noise + _power(y_mean) * x_noise)
+    white = 1 / np.sqrt(power_of(x_mean) * y_noise + power_of(y_mean) * x_noise)
     mean, by_y, by_x = white * x_mean * y_mean, white * x_mean, white * y_mean
     deviation = by_y[:, None] * y - by_x[:, None] * x
-    power = np.maximum(np.add.reduceat(_power(mean), layout.edges, axis=1), TINY)
+    power = np.maximum(np.add.reduceat(power_of(mean), layout.edges, axis=1), TINY)
     smooth, gain = [], []
     # A drift of either channel is a polynomial times the mean of the other one.
     for row in range(len(mean)):
@@ -345,7 +289,7 @@ def _of_currents(of: _Rows, own: "_Deviations", other: "_Deviations") -> Repeats
 
 def _joined(
     of: _Rows,
-    own: "_Deviations",
+    own: Deviations,
     smooth: Complex[np.ndarray, "lane polynomial band"],
     unloaded: Float[np.ndarray, "lane period"],
     unloaded_variance: Float[np.ndarray, " lane"],
@@ -368,139 +312,3 @@ def _phases(
     below = np.where(low < -half[:, 0], np.count_nonzero(v < -half, axis=1), 0)
     shorter = np.minimum(above, below)
     return np.where(shorter > 0, shorter, np.maximum(above, below))
-
-
-def _smooth(mean: np.ndarray, layout: Bands) -> np.ndarray:
-    """Σ conj(Y) times each polynomial, for each recording and band."""
-    products = np.conj(mean)[:, None, :] * layout.polynomials
-    return np.add.reduceat(products, layout.edges, axis=2)
-
-
-class _Deviations(NamedTuple):
-    """`gain`, `power` and `variance` as in `Repeats`, mean, delay of each cut, `_transforms`."""
-
-    gain: np.ndarray
-    power: np.ndarray
-    variance: np.ndarray
-    mean: np.ndarray
-    late: np.ndarray
-    raw: np.ndarray
-
-
-def _deviations(
-    raw: Complex[np.ndarray, "lane period harmonic"],
-    late: Float[np.ndarray, "lane period"],
-    layout: Bands,
-    least: Float[np.ndarray, "lane band"],
-    aliased: Bool[np.ndarray, " lane"],
-) -> "_Deviations":
-    """Deviations of periods, and at least this noise.
-
-    Args:
-        raw: Transforms of the periods.
-        late: By how much each of them is cut late [samples]; exact for records whose aliases are
-            known (`aliased`).
-        layout: The bands.
-        least: `_Rows.noise`.
-        aliased: Records whose aliases are known.
-    """
-    periods = raw.shape[1]
-    power, mean, weight, gain = _compared(raw, late, layout)
-    line = np.arange(periods) - (periods - 1) / 2
-    line /= np.linalg.norm(line)
-    for _ in range(5):  # a clock error of 200 ppm needs three
-        # Least-squares estimate of a delay, η = jωτ; it is approximate if the gain changes too.
-        of_delay = layout.middle * weight / least
-        total = (layout.middle * of_delay).sum(1)
-        more = (np.imag(gain) * of_delay[:, None, :]).sum(2) / total[:, None]
-        surely = np.maximum(ALIGNED, SURE / np.sqrt(total))
-        # Two clocks make a line of the delays, which is known better than each of them.
-        slope = more @ line
-        by_line = np.abs(slope) > surely
-        singly = np.abs(more).max(1) > 1.5 * surely
-        moved = (by_line | singly) & ~aliased
-        if not moved.any():
-            break
-        line_of = np.where(by_line, slope, 0)[:, None] * line
-        late = late + np.where(aliased[:, None], 0, np.where(singly[:, None], more, line_of))
-        again = _compared(raw[moved], late[moved], layout)
-        for whole, part in zip((power, mean, weight, gain), again, strict=True):
-            whole[moved] = part
-    # The part that no change of the gain explains is noise, or aliases.
-    left, quiet = np.full(len(raw), periods - 1), gain
-    if aliased.any():
-        turn = _rotations(late[aliased])[1][..., : periods - 2]
-        left[aliased] -= turn.any(1).sum(1)
-        power[aliased], _, _, of_rest = _compared(raw[aliased], late[aliased], layout, turn)
-        quiet = gain.copy()
-        quiet[aliased] = of_rest
-    rest = np.add.reduceat(power, layout.edges, axis=1) - weight * _power(quiet).sum(1)
-    freedom = 2 * (layout.number - 1) * left[:, None]
-    plain = layout.middle < 2 * np.pi * PLAIN
-    excess = (rest / least)[:, plain].sum(1) / np.maximum(freedom[:, plain].sum(1), 1)
-    overall = np.maximum(excess, 1.0)[:, None] * least
-    freedom = np.maximum(freedom, 1)
-    sure = rest > overall * (freedom + SURE * np.sqrt(2 * freedom))
-    noise = np.where(sure & (layout.number > 1), rest / freedom, overall)
-    single = np.count_nonzero(layout.number == 1)
-    if single > 2:
-        low = _noise_of_single(quiet[:, :, :single], (weight / overall)[:, :single], left)
-        sure = low > 1 + SURE * np.sqrt(2 / ((single - 2) * left))
-        noise[:, :single] = np.where(sure, low, 1.0)[:, None] * overall[:, :single]
-    return _Deviations(gain, weight, noise / weight, mean, late, raw)
-
-
-def _noise_of_single(
-    gain: np.ndarray, weight: np.ndarray, left: Int[np.ndarray, " lane"]
-) -> np.ndarray:
-    """Noise of the bands of one harmonic relative to 1/weight, of so many deviations.
-
-    It is found from second differences between these bands. A change of the load is smooth over the
-    first harmonics; coloured noise is not.
-    """
-    bend = gain[:, :, :-2] - 2 * gain[:, :, 1:-1] + gain[:, :, 2:]
-    spread = 1 / weight[:, :-2] + 4 / weight[:, 1:-1] + 1 / weight[:, 2:]
-    freedom = 2 * left * bend.shape[2]
-    return (_power(bend) / spread[:, None, :]).sum((1, 2)) / freedom
-
-
-def _power(values: np.ndarray) -> np.ndarray:
-    return np.real(values) ** 2 + np.imag(values) ** 2
-
-
-def _compared(
-    raw: np.ndarray,
-    late: Float[np.ndarray, "lane period"],
-    layout: Bands,
-    turn: Complex[np.ndarray, "lane period direction"] | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Power of the deviations, mean, its power, and `gain`, for periods with these delays.
-
-    Deviations in the directions `turn` are removed.
-    """
-    # Most recordings of a batch are cut alike.
-    alike = late[:1] if (late == late[0]).all() else late
-    turn_back = turns(alike * (2 * np.pi / layout.size), 1, raw.shape[2] + 1)
-    deviation = raw * turn_back.astype(np.complex64)
-    mean = np.einsum("lpk->lk", deviation) / raw.shape[1]  # faster than `mean`
-    deviation -= mean[:, None, :]
-    if turn is not None:
-        along = turn.astype(np.complex64)
-        deviation -= along @ (along.conj().swapaxes(1, 2) @ deviation)
-    deviation = _without(deviation, layout.polynomials)
-    weight = np.maximum(np.add.reduceat(_power(mean), layout.edges, axis=1).astype(float), TINY)
-    parts = deviation.view(np.float32)
-    square = np.einsum("lpk,lpk->lk", parts, parts)
-    deviation *= np.conj(mean)[:, None, :]
-    sums = np.add.reduceat(deviation, layout.edges, axis=2)
-    return square[:, ::2] + square[:, 1::2], mean, weight, sums / weight[:, None, :]
-
-
-def _without(deviation: np.ndarray, polynomials: np.ndarray) -> np.ndarray:
-    """Deviations without their projection on the polynomials; changed in place."""
-    # Real and imaginary parts side by side: the real part of a product is the product of these.
-    real, basis = deviation.view(np.float32), polynomials.view(np.float32)
-    # One recording after the other, because such small products start no threads.
-    for own in real:
-        own -= (own @ basis.T) @ basis
-    return deviation

@@ -29,10 +29,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from etid.signals.harmonics import COHERENT, flat, harmonics_of, separates_aliases
+from etid.signals.harmonics import COHERENT, flat, separates_aliases
 from etid.signals.periods import Periods
-from etid.signals.pulse_train import PHASES
 
+# Relative to the sample rate. Below the first, the drift of the mean is larger than a delay; above
+# the second, aliases are a twentieth of the signal.
+PHASES = 0.005, 0.05
 SEAM = 4  # samples on each side of the joint between two periods
 PLACES = np.linspace(0.0, 0.5, 6)  # of the sample rate, where weights are found
 PAIRS = np.arange(1, 3)  # multiples k of the sample rate whose aliases count
@@ -287,12 +289,17 @@ def weighted(
     # A level at the joints would become a step there.
     joints = (ends[1:-1, None] + np.arange(-SEAM, SEAM)).ravel()
     v = v - v[..., joints].mean(-1, keepdims=True)
-    found = 0.0
+    # Each period alone, in the place that it has in equal parts of the record (`harmonics_of`).
+    size = samples // math.gcd(periods, samples)
+    alone = np.zeros((*v.shape[:-1], periods, size))
     for number, (begin, end) in enumerate(itertools.pairwise(ends)):
-        alone = np.zeros(v.shape)
-        alone[..., begin:end] = v[..., begin:end]
-        one = periods * harmonics_of(alone, periods)
-        place = np.arange(1, one.shape[-1] + 1) * (periods / samples)
-        turn = np.exp(2j * np.pi * place * (number * (spacing - samples / periods)))
-        found = found + one * (np.interp(place, PLACES, of[:, number]) * turn)
-    return np.asarray(found)
+        at = begin % size
+        inside = min(end - begin, size - at)
+        alone[..., number, at : at + inside] = v[..., begin : begin + inside]
+        alone[..., number, : end - begin - inside] = v[..., begin + inside : end]
+    step = periods * size // samples
+    each = np.fft.rfft(alone)[..., step : (size + 1) // 2 : step]
+    place = np.arange(1, each.shape[-1] + 1) * (periods / samples)
+    by = np.array([np.interp(place, PLACES, one) for one in of.T]) * (periods / samples)
+    late = np.arange(periods) * (spacing - samples / periods)
+    return np.einsum("...pk,pk->...k", each, by * np.exp(2j * np.pi * np.outer(late, place)))

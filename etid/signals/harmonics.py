@@ -299,8 +299,8 @@ def aliases(
     fall = xp.log(lower / upper) / np.log(middle * 2 / sum(LOWER))
     level = xp.where(exceeds_noise, signals[1], 0.0)
     # Padded harmonics lie above half the sample rate; they have no aliases.
-    mirrored = np.maximum(1 - position, 0.5) / middle
-    power = level[..., None] * mirrored ** -fall[..., None]
+    mirrored = np.log(np.maximum(1 - position, 0.5) / middle)
+    power = level[..., None] * xp.exp(-fall[..., None] * mirrored)
     return Aliases(power, fall, COHERENT * samples / periods)
 
 

@@ -251,14 +251,17 @@ def _between(
     middle = xp.sort(of_period, axis=-1)[..., [periods // 2]]
     mean = of_period.mean(-1)[..., None]
     usual = xp.where((mean > 0) & (periods > 2), middle / xp.where(mean > 0, mean, 1.0), 1.0)
-    window = window_of(loud, periods, samples)
+    window, kept = window_of(loud, periods, samples)
     slope = xp.vecdot(v, layout.stairs)[..., None]
-    quiet = (v - xp.mean(v, axis=-1, keepdims=True) - slope * layout.line) * window
-    transform = xp.fft.rfft(quiet)
-    squares = xp.real(transform) ** 2 + xp.imag(transform) ** 2
-    used = squares[..., : layout.used.size] * layout.used
-    sums = xp.add.reduceat(used, layout.edges, axis=-1) / np.maximum(layout.number - 1, 1.0)
-    return sums, xp.vecdot(window, window)[..., None] / samples, usual
+    quiet = v - xp.mean(v, axis=-1, keepdims=True)
+    quiet -= slope * layout.line
+    quiet *= window
+    transform = xp.fft.rfft(quiet)[..., : layout.used.size]
+    squares = xp.real(transform) ** 2
+    squares += xp.imag(transform) ** 2
+    squares *= layout.used
+    sums = xp.add.reduceat(squares, layout.edges, axis=-1) / np.maximum(layout.number - 1, 1.0)
+    return sums, xp.broadcast_to(kept, usual.shape), usual
 
 
 class Measurement(Module):

@@ -12,7 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from etid.signals.pulse_train import RATE, fast_length
+from etid.signals.pulse_train import RATE
+
+TOGETHER = 8  # records that are transformed together; more leave the cache
 
 
 class Periods(NamedTuple):
@@ -42,19 +44,21 @@ class Periods(NamedTuple):
         tail, cuts beside their place would look like a change.
         """
         length = length_of(period)
-        starts = np.minimum(np.rint(at), v.shape[1] - length).astype(int)
-        cut = np.empty((*starts.shape, length))
-        alike = (starts == starts[0]).all()
-        for row in [slice(None)] if alike else range(len(v)):
-            for number, start in enumerate(starts[0 if alike else row].tolist()):
-                cut[row, number] = v[row, start : start + length]
-        first, last = cut[..., [0, -1]].mean(1).T[..., None]
-        cut -= (first + (last - first) * np.linspace(0, 1, length))[:, None]
-        size = fast_length(length)
-        return cls(np.fft.rfft(cut, size), starts, size)
+        starts, size = np.minimum(np.rint(at), v.shape[1] - length).astype(int), fast_length(length)
+        each = np.empty((*starts.shape, size // 2 + 1), complex)
+        line = np.linspace(0, 1, length)
+        for first in range(0, len(v), TOGETHER):
+            rows = slice(first, first + TOGETHER)
+            cut = _cut(v[rows], starts[rows], length)
+            begin, end = cut[..., [0, -1]].mean(1).T[..., None]
+            cut -= (begin + (end - begin) * line)[:, None]
+            np.fft.rfft(cut, size, out=each[rows])
+        return cls(each, starts, size)
 
     def take(self, rows: Int[np.ndarray, " row"] | Bool[np.ndarray, " record"]) -> "Periods":
-        """Those of some of the records."""
+        """Those of some of the records; no copy of all."""
+        if rows.size == len(self.starts) and (rows.dtype != bool or rows.all()):
+            return self
         return Periods(self.each[rows], self.starts[rows], self.size)
 
     def late(self, spacing: Float[np.ndarray, " record"]) -> Float[np.ndarray, "record period"]:
@@ -79,6 +83,17 @@ class Periods(NamedTuple):
         return self.each[..., first:end] * turn, place[first:end]
 
 
+def _cut(
+    v: Float[np.ndarray, "record time"], starts: Int[np.ndarray, "record period"], length: int
+) -> Float[np.ndarray, "record period part"]:
+    """The parts of records that begin at these samples."""
+    cut, alike = np.empty((*starts.shape, length)), (starts == starts[0]).all()
+    for row in [slice(None)] if alike else range(len(v)):
+        for number, start in enumerate(starts[0 if alike else row].tolist()):
+            cut[row, number] = v[row, start : start + length]
+    return cut
+
+
 def turns(
     angle: Float[np.ndarray, "*cut"], first: int, end: int
 ) -> Complex[np.ndarray, "*cut place"]:
@@ -95,3 +110,10 @@ def turns(
 def length_of(period: float) -> int:
     """Samples of a period that are used: its measured length may differ from the nominal one."""
     return int((1 - RATE) * period)
+
+
+@functools.cache
+def fast_length(least: int) -> int:
+    """The smallest length 2^i 3^j 5^k that is not below `least`: its Fourier transform is fast."""
+    odd = (3**j * 5**k for j in range(30) for k in range(20))
+    return min(of << (-(-least // of) - 1).bit_length() for of in odd)

@@ -49,7 +49,8 @@ def changes(
 ) -> Float[Array | np.ndarray, "*record period part"]:
     """Sum of the squares of the differences of samples in each part."""
     xp, change = namespace(v), namespace(v).diff(v)
-    change = xp.add.reduceat(change * change, _places(periods, v.shape[-1]).at, axis=-1)
+    change *= change
+    change = xp.add.reduceat(change, _places(periods, v.shape[-1]).at, axis=-1)
     return change.reshape(*change.shape[:-1], periods, BLOCKS)
 
 
@@ -67,16 +68,29 @@ def are_loud(
 
 def window_of(
     loud: Bool[Array | np.ndarray, "*record part"], periods: int, samples: int
-) -> Float[Array | np.ndarray, "*record time"]:
-    """The windows of records with these loud parts; 1 everywhere if too little would be left."""
+) -> tuple[Float[Array | np.ndarray, "*#record time"], Float[Array | np.ndarray, "*#record 1"]]:
+    """The windows of records with these loud parts, and their mean squares.
+
+    A window is 1 everywhere if too little would be left. Records with the same parts share one.
+    """
     if not isinstance(loud, np.ndarray):
         return _window(loud, periods, samples)
-    return np.stack([_known(one.tobytes(), periods, samples) for one in loud])
+    known = [one.tobytes() for one in loud]
+    known = known[:1] if len(set(known)) == 1 else known  # most records are alike
+    windows, kept = zip(*(_known(one, periods, samples) for one in known), strict=True)
+    return (
+        (windows[0][None], kept[0][None])
+        if len(known) == 1
+        else (np.stack(windows), np.stack(kept))
+    )
 
 
 @functools.lru_cache(maxsize=64)
-def _known(loud: bytes, periods: int, samples: int) -> Float[np.ndarray, " time"]:
-    return np.asarray(_window(np.frombuffer(loud, bool), periods, samples))
+def _known(
+    loud: bytes, periods: int, samples: int
+) -> tuple[Float[np.ndarray, " time"], Float[np.ndarray, "1"]]:
+    window, kept = _window(np.frombuffer(loud, bool), periods, samples)
+    return np.asarray(window), np.asarray(kept)
 
 
 def _rise(place: Float[np.ndarray, "*place"]) -> Float[np.ndarray, "*place"]:
@@ -94,11 +108,12 @@ _SHARES = _rise(_AWAY + 0.5) - _rise(_AWAY - 0.5)
 
 def _window(
     loud: Bool[Array | np.ndarray, "*record part"], periods: int, samples: int
-) -> Float[Array | np.ndarray, "*record time"]:
+) -> tuple[Float[Array | np.ndarray, "*record time"], Float[Array | np.ndarray, "*record 1"]]:
     """0 in loud parts, 1 from 2 `EDGE` parts beside them, and a raised cosine between."""
     xp, places = namespace(loud), _places(periods, samples)
     far = xp.where(loud[..., _NEAR[:, :-1]].any(-1), 0.0, 1.0)
     points = (far[..., _NEAR] @ _SHARES).reshape(*loud.shape[:-1], -1)
     rise = xp.roll(points, -1, axis=-1) - points
     window = points[..., places.point] + places.beyond * rise[..., places.point]
-    return xp.where(xp.mean(window, axis=-1)[..., None] > QUIET, window, 1.0)
+    window = xp.where(xp.mean(window, axis=-1)[..., None] > QUIET, window, 1.0)
+    return window, xp.vecdot(window, window)[..., None] / samples
