@@ -37,18 +37,18 @@ alike.
 """
 
 import dataclasses
+import statistics
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy import special
 
 from etid.precision import namespace
 from etid.signals.transfer import AnyArray, frequency_variable, from_parts, reciprocal
 
 FALSE_ALARMS = 1e-4  # probability that chance exceeds the limit of one test
-SEEN = float(-special.ndtri(FALSE_ALARMS / 2))  # a normal number exceeds it with this probability
+SEEN = -statistics.NormalDist().inv_cdf(FALSE_ALARMS / 2)  # of a normal number
 RELAXATIONS = 7  # time constants, two per decade; a relaxation is wider than that
 BEYOND = 2.0  # factor by which they exceed the band
 # Faster relaxations of a layer of diffusion, by √(τ₁/τ). The rest adds 3 % of R_p to R_s.
@@ -156,7 +156,8 @@ class Direction:
     @property
     def limit(self) -> float:
         """|z| that the largest of all changes exceeds in one good recording of 10 000."""
-        return self.deviation * float(-special.ndtri(FALSE_ALARMS / 2 / self.count))
+        chance = FALSE_ALARMS / 2 / self.count
+        return -self.deviation * statistics.NormalDist().inv_cdf(chance)
 
     def relevant(self, z: AnyArray, size: AnyArray, moved: AnyArray) -> AnyArray:
         """z; 0 if the change is too small to matter, or if the circuit can make it itself.

@@ -90,10 +90,12 @@ class Instrument(Module):
         each = *ON_LOADS, *(name for name in OF_RESISTORS for _ in range(resistors))
         return jnp.stack([jnp.asarray(getattr(self, name)) for name in each])
 
-    def budgeted(self) -> Float[Array, " error"]:
+    def budgeted(self) -> Float[AnyArray, " error"]:
         """The tolerance of each of `BUDGETED`; 0 if none is stated."""
         told = [getattr(self, name, None) for name in BUDGETED]
-        return jnp.stack([jnp.asarray(0.0 if one is None else one) for one in told])
+        told = [0.0 if one is None else one for one in told]
+        xp = namespace(*told)
+        return xp.stack([xp.asarray(one) for one in told])
 
     def complete(self: _Kind) -> _Kind:
         """The same with the size in `BUDGETED` for each error that nobody stated."""
