@@ -21,6 +21,7 @@ mean power in the upper and in the lower part of the band, where they come from 
 determine a spectrum S f^(−p), which is continued.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Callable
@@ -101,18 +102,22 @@ def longer(
     """
     periods = of.starts.shape[1]
     line = np.arange(periods) - (periods - 1) / 2
-    known, like = np.unique(spacing, return_inverse=True)
-    turn = _turns(known, periods)[:, 0]
-    others = np.stack([np.ones(turn.shape), np.real(turn), np.imag(turn)], axis=-1)
-    apart = line - (others @ np.linalg.pinv(others, rcond=1e-6)) @ line
-    told = np.vecdot(apart, apart) >= TOLD * (line @ line)
-    apart = np.where(told[:, None], apart, line)[like]
+    apart = np.array([_apart(one, periods) for one in spacing.tolist()])
     each, place = of.turned(spacing, *PHASES)
     slope = -2j * np.pi * place * each.mean(1) * (apart @ line)[:, None]
     moved, power = np.einsum("rp,rpk->rk", apart, each), np.vecdot(slope, slope).real
     found = np.vecdot(slope, moved).real / power
     rest = moved - found[:, None] * slope
     return found, np.sqrt(np.vecdot(rest, rest).real / (2 * place.size * power))
+
+
+@functools.lru_cache(maxsize=256)  # most records have the nominal spacing
+def _apart(spacing: float, periods: int) -> Float[np.ndarray, " period"]:
+    """A line over the periods without what aliases of the first pair can make of it."""
+    line, turn = np.arange(periods) - (periods - 1) / 2, _turns(spacing, periods)[0]
+    others = np.stack([np.ones(periods), np.real(turn), np.imag(turn)], axis=1)
+    apart = line - others @ np.linalg.lstsq(others, line, rcond=1e-6)[0]
+    return line if apart @ apart < TOLD * (line @ line) else apart
 
 
 def exact_spacing(
