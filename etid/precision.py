@@ -32,6 +32,23 @@ def namespace(*values: Any) -> ModuleType:
     return np
 
 
+def array_function(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A function of rows, whoever calls it.
+
+    NumPy says nothing about a row whose numbers are not finite: its verdict does. JAX multiplies
+    real by complex numbers, and arrays of different ranks, as NumPy does, even where its user has
+    forbidden this for own code.
+    """
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        of_jax = jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow")
+        with np.errstate(all="ignore"), of_jax[0], of_jax[1]:
+            return function(*args, **kwargs)
+
+    return call
+
+
 def in_float64(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """The function, run in float64, with NaN as a result. The process keeps its own settings.
 

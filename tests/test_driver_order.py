@@ -174,7 +174,7 @@ def test_a_driver_tells_the_start_that_led_to_it(monkeypatch, method):
 
     told = etid.identify_driver(calibration, order=3, method=method, throw=False)
     monkeypatch.setattr(refined_driver, "source_starts", reversed_starts)
-    monkeypatch.setattr(identify, "_identified", program(inspect.unwrap(identify._identified)))
+    monkeypatch.setattr(identify, "_traced", program(inspect.unwrap(identify._traced)))
     turned = etid.identify_driver(calibration, order=3, method=method, throw=False)
     assert isinstance(told, ContinuousDriver)
     assert isinstance(turned, ContinuousDriver)

@@ -7,7 +7,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import etid
-from etid.estimators.estimate import DELAY_WIDTH, prior
+from etid.likelihood.source_prior import DELAY_WIDTH, SourcePrior
 from etid.signals.harmonics import filled, harmonics
 from etid.signals.noise import noise
 from etid.signals.transfer import delayed
@@ -44,7 +44,9 @@ def information(driver):
     variance = (sigma_out**2 + np.abs(np.asarray(gain(at))) ** 2 * sigma_th**2) / size
     weight = np.where(selected, 2 * np.abs(x) ** 2 / variance, 0.0)
     told = np.real((slopes * weight) @ slopes.conj().T)
-    weak = jax.jacfwd(prior(driver.source, jnp.asarray(rate), jnp.asarray(R_LOAD)))(parameters)
+    weak = jax.jacfwd(SourcePrior.of(driver.source, jnp.asarray(rate), jnp.asarray(R_LOAD)))(
+        parameters
+    )
     told[:-1, :-1] += np.asarray(weak.T @ weak)
     told[-1, -1] += 1 / DELAY_WIDTH**2
     return told

@@ -17,9 +17,9 @@ from etid import cli
 from etid.circuits.circuit import AbstractCircuit, Farad, Ohm, parameter
 from etid.circuits.elements import capacitor, resistor
 from etid.circuits.impedance import parallel, series
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import given
+from etid.likelihood.calibrations import Calibrations
 from etid.online.current import CurrentModel
 from etid.recordings.remarks import Remark
 from etid.results.driver import ContinuousDriver, HarmonicDriver
@@ -287,7 +287,7 @@ def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax(resistors):
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
     of = Calibrations.of(driver)
     common = of.start() + jnp.linspace(0.1, 1.0, of.start().size)
-    found = np.asarray(jax.jit(lambda c: of.slopes(c).by_unknown)(common)).transpose(1, 2, 0)
+    found = np.asarray(jax.jit(lambda c: of.slopes(c).by_q)(common)).transpose(1, 2, 0)
     wanted = np.asarray(jax.jit(jax.jacfwd(of.gains))(common))
     size = np.abs(wanted).max(axis=(0, 1)) + (wanted == 0).all(axis=(0, 1))
     # Rounding, times the condition of a sum over the poles of Z_th.

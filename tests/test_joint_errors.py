@@ -6,8 +6,8 @@ import numpy as np
 
 from etid.estimators.joint import errors
 from etid.estimators.joint.terms import Loads
-from etid.estimators.sandwich import Curvature, Linear
 from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.sandwich import Curvature, Linear
 from etid.signals.harmonics import Spectrum
 
 COMMON, OWN, ROWS, NOISE = 2, 3, 12, 4  # parameters, terms of a load, numbers of a record's noise

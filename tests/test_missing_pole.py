@@ -8,8 +8,8 @@ import pytest
 import etid
 from benchmarks.failure_axes import transformer
 from benchmarks.ladder import CALIBRATION, rung
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
-from etid.estimators.score_tests import of_calibrations
+from etid.likelihood import of_calibrations
+from etid.likelihood.calibrations import Calibrations
 from etid.results.driver import SourceImpedance
 
 

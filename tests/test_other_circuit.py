@@ -16,9 +16,9 @@ from benchmarks.perturbed_study import all_records, out, undisturbed
 from etid.circuits import directions
 from etid.circuits.circuit import Resistor, impedance_at
 from etid.circuits.directions import DIRECTIONS, FALSE_ALARMS, At, scored
-from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.score_tests.other_circuit import Score, Scores
+from etid.likelihood.sandwich import Linear
 from etid.simulation.scenes import Trial
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")

@@ -11,7 +11,7 @@ import pytest
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.circuits.elements import resistor
-from etid.estimators.estimate import DELAY_WIDTH, KNOWN_DELAY, SOLVER, delay_std
+from etid.estimators.estimate import SOLVER
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.output_error.estimator import _has_aliases, _leaves_out
 from etid.estimators.output_error.fit import fit_source
@@ -29,6 +29,7 @@ from etid.estimators.output_error.prediction import (
 )
 from etid.estimators.registry import OUTPUT_ERROR
 from etid.identify.fitting import skin
+from etid.likelihood.source_prior import DELAY_WIDTH, KNOWN_DELAY, delay_std
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, SourceImpedance
 from etid.signals.filtering import simulate

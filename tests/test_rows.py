@@ -13,13 +13,13 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.rows import loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
-from etid.likelihood.arrays import array_function
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import Gains
 from etid.likelihood.linear import NormalEquations, levenberg_marquardt
 from etid.likelihood.profile import Profile, Records
 from etid.likelihood.search import Near, minimum
 from etid.likelihood.starts import starts
+from etid.precision import array_function
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Trial
 

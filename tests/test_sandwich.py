@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from etid.estimators.sandwich import Linear
+from etid.likelihood.sandwich import Linear
 
 RNG = np.random.default_rng(0)
 J = RNG.normal(size=(4, 60))

@@ -9,21 +9,31 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from etid.estimators.estimate import SOLVER, Estimate
-from etid.estimators.judgement import MAX_STEPS_REACHED, misses, remarks, too_late
+from etid.estimators.estimate import SOLVER
+from etid.estimators.judgement import MAX_STEPS_REACHED, misses, remarks
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood import driver as maximum_likelihood
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
-from etid.estimators.score_tests import of_calibrations
 from etid.estimators.starts import source_starts
 from etid.estimators.steiglitz_mcbride import iteration
+from etid.likelihood import driver, of_calibrations
+from etid.likelihood.calibrations import Calibrations
+from etid.likelihood.linear import inverse
+from etid.likelihood.noise import shows_hum
+from etid.likelihood.source_prior import delay_std, delay_width
+from etid.numpy_tier.algebra import one_thread
+from etid.numpy_tier.tiers import program
+from etid.precision import array_function, namespace
+from etid.recordings.remarks import Remark
 from etid.results.driver import Calibration, ContinuousDriver, HarmonicDriver, SourceImpedance
+from etid.results.fit import complex_rrse
 from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS, first_verdict
+from etid.signals import modal
+from etid.signals.harmonics import Spectrum
 from etid.signals.knots import above_noise, banded
 from etid.signals.noise import Measurement
-from etid.signals.transfer import Rational
+from etid.signals.transfer import AnyArray, Rational
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
@@ -35,16 +45,20 @@ UNWANTED = 1e3  # added to the cost of a start that did not converge; larger tha
 SPLIT, BLURRED = 0.1, 1.0
 
 
-def is_split(source: SourceImpedance) -> Bool[Array, ""]:
+def is_split(source: SourceImpedance) -> Bool[AnyArray, "*start"]:
     """Whether two sections of a source coincide."""
-    place = jnp.stack([source.log_omega, source.log_zeta])
-    first, second = np.triu_indices(place.shape[1], 1)
-    return jnp.any(jnp.all(jnp.abs(place[:, first] - place[:, second]) < SPLIT, axis=0))
+    xp = namespace(source.log_omega)
+    place = xp.stack([source.log_omega, source.log_zeta])
+    first, second = np.triu_indices(place.shape[-1], 1)
+    near = xp.abs(place[..., first] - place[..., second]) < SPLIT
+    return near.all(0).any(-1)
 
 
+@one_thread()
+@array_function
 def from_harmonics(
     records: Harmonics,
-    r_load: Float[Array, " record"],
+    r_load: Float[AnyArray, " record"],
     order: int,
     method: str,
     instrument: Instrument | None,
@@ -54,43 +68,63 @@ def from_harmonics(
     The fits from all starts use bands of harmonics. The best is refined with all harmonics of the
     bands in which V_th exceeds its noise.
     """
-    bands, rate = banded(records.spectrum), jnp.asarray(records.sample_rate)[0]
-    spectra = above_noise(records.spectrum, bands)
-    baseline = iteration.periodic_driver_filter(spectra, r_load, rate, order)
-
-    def fit(start: SourceImpedance) -> maximum_likelihood.Rough:
-        return maximum_likelihood.rough_source(spectra, bands, r_load, rate, start)
-
-    starts = source_starts(baseline.filter.den, order, rate, r_load.mean())
-    # One start after the other. In parallel all would run as long as the slowest, and be slower.
-    found = jax.lax.map(fit, starts)
-    passive = jax.vmap(_is_passive, (0, 0, None))(found.source, found.cov, rate)
-    ranked = jnp.argsort(jax.vmap(_cost)(found.source, found.cost, passive))
-    candidates = jax.tree.map(lambda leaf: leaf[ranked], found)
-    calibrations, estimate, near, linear = maximum_likelihood.fit_source(
-        spectra, r_load, rate, candidates, instrument
-    )
-    estimate = dataclasses.replace(estimate, start=ranked[estimate.start])
-    source, calibration = calibrations.source, calibrations.calibration
-    statistic = jnp.nanmax(of_calibrations.missing_pole(calibrations, near, linear))
+    spectrum, r_load = jax.tree.map(np.asarray, (records.spectrum, r_load))
+    rate = np.asarray(records.sample_rate)[0]
+    bands = banded(spectrum)
+    spectra = above_noise(spectrum, bands)
+    baseline = jax.tree.map(np.asarray, _baseline(spectra, r_load, rate, order))
+    starts = source_starts(baseline.den, order, rate, r_load.mean())
+    first = jax.tree.map(lambda of: of[0], starts)
+    calibration = Calibration(r_load, np.zeros(r_load.shape), delay_std(r_load))
+    width = delay_width(instrument, rate)
+    model = Calibrations(first, calibration, spectra, rate, width, instrument)
+    each = starts.vector()
+    delays = np.zeros((len(each), r_load.size))
+    found = driver.rough(model, bands, np.concatenate([each, delays], -1))
+    sources = jax.tree.map(lambda *of: np.stack(of), *map(model.source_of, found.q))
+    kept = found.q.shape[-1] - r_load.size
+    passive = _is_passive(sources, inverse(found.matrix)[:, :kept, :kept], rate)
+    ranked = np.argsort(_cost(sources, found.cost, passive), kind="stable")
+    model, near, least, start = driver.identified(model, found, ranked.tolist())
+    linear = model.linear(near)
+    cov = linear.first(model.unknowns).covariance()[:kept, :kept]  # at these errors
+    statistic = np.nanmax(of_calibrations.missing_pole(model, near, linear))
+    calibration = model.calibration
     if r_load.size > 1:
-        off = of_calibrations.mismatch(calibrations, near, linear)
+        off = of_calibrations.mismatch(model, near, linear)
         calibration = dataclasses.replace(calibration, mismatch=off.off, across=off.across)
-    terms = 2 * jnp.sum(spectra.selected, dtype=rate.dtype)
-    passive = _is_passive(source, estimate.cov, rate)
+    chi2 = 2 * least.objective / (model.terms - model.unknowns)
+    rrse = complex_rrse(near.profiles[0].gains * spectra.x, spectra.y, spectra.selected).max()
+    squares = model.squares(near.profiles)
+    hum = shows_hum(squares, spectra.frequency[0], spectra.selected)
+    passive = _is_passive(model.source, cov, rate)
+    faults = _faults(chi2, rrse, least.settled, calibration, passive, model.terms, statistic)
+    too_low = statistic > of_calibrations.MISSING_POLE
     return HarmonicDriver(
-        **_fields(baseline.filter, estimate, rate),
-        source=source,
+        b=baseline.num,
+        a=baseline.den,
+        sample_rate=rate,
+        cov=cov,
+        rrse=rrse,
+        chi2=chi2,
+        steps=least.points,
+        start=np.asarray(start),
+        remarks=np.where(hum, int(Remark.mains_hum), 0),
+        source=model.source,
         calibration=calibration,
-        result=first_verdict(
-            *_faults(estimate, calibration, passive, terms, statistic),
-            (statistic > of_calibrations.MISSING_POLE, RESULTS.order_too_low),
-        ),
+        result=first_verdict(*faults, (too_low, RESULTS.order_too_low)),
         method=method,
         spectra=spectra,
         instrument=instrument,
         missing_pole=statistic,
     )
+
+
+@program
+def _baseline(
+    spectra: Spectrum, r_load: Float[Array, " record"], rate: Float[Array, ""], order: int
+) -> Rational:
+    return iteration.periodic_driver_filter(spectra, r_load, rate, order).filter
 
 
 def from_samples(
@@ -132,69 +166,77 @@ def from_samples(
     source, estimate, calibration, passive = jax.tree.map(lambda leaf: leaf[-1], found)
     terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
     return ContinuousDriver(
-        **_fields(baseline, estimate, rate),
+        b=baseline.num,
+        a=baseline.den,
+        sample_rate=rate,
+        cov=estimate.cov,
+        rrse=estimate.rrse,
+        chi2=estimate.chi2,
+        steps=estimate.steps,
+        start=estimate.start,
+        remarks=remarks(estimate),
         source=source,
         calibration=calibration,
-        result=first_verdict(*_faults(estimate, calibration, passive, terms)),
+        result=first_verdict(
+            *_faults(
+                estimate.chi2,
+                estimate.rrse,
+                estimate.result == optx.RESULTS.successful,
+                calibration,
+                passive,
+                terms,
+            )
+        ),
         instrument=instrument,
         method=method,
     )
 
 
-def _fields(baseline: Rational, estimate: Estimate, rate: Float[Array, ""]) -> dict[str, Any]:
-    """What the drivers of both methods have from their baseline and their estimate."""
-    return {
-        "b": baseline.num,
-        "a": baseline.den,
-        "sample_rate": rate,
-        "cov": estimate.cov,
-        "rrse": estimate.rrse,
-        "chi2": estimate.chi2,
-        "steps": estimate.steps,
-        "start": estimate.start,
-        "remarks": remarks(estimate),
-    }
-
-
+@array_function
 def _is_passive(
-    source: SourceImpedance, cov: Float[Array, "parameter parameter"], rate: Float[Array, ""]
-) -> Bool[Array, ""]:
+    source: SourceImpedance,
+    cov: Float[AnyArray, "*start parameter parameter"],
+    rate: Float[AnyArray, ""],
+) -> Bool[AnyArray, "*start"]:
     """Whether Re Z_th is nowhere negative by more than its standard errors allow."""
-    frequency = jnp.asarray(BAND) * rate
-    z_th, slopes = source.with_slopes(frequency)
+    xp, frequency = namespace(cov), BAND * rate
+    z_th, slopes = modal.with_slopes(source.vector(), source.log_omega.shape[-1], frequency)
     slope = slopes.real
-    error = jnp.sqrt(jnp.maximum(jnp.sum(slope * (cov @ slope), axis=0), 0.0))
-    return jnp.min(z_th.real + PASSIVE * error) >= 0
+    error = xp.sqrt(xp.maximum((slope * (cov @ slope)).sum(-2), 0.0))
+    return (z_th.real + PASSIVE * error).min(-1) >= 0
 
 
 def _cost(
-    source: SourceImpedance, cost: Float[Array, ""], passive: Bool[Array, ""]
-) -> Float[Array, ""]:
+    source: SourceImpedance, cost: Float[AnyArray, "*start"], passive: Bool[AnyArray, "*start"]
+) -> Float[AnyArray, "*start"]:
     """The cost by which starts compete; passive circuits come first."""
-    cost = cost + jnp.where(passive, 0.0, UNWANTED)
-    cost = cost + jnp.where(is_split(source), BLURRED, 0.0)
-    return jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+    xp = namespace(cost)
+    cost = cost + xp.where(passive, 0.0, UNWANTED)
+    cost = cost + xp.where(is_split(source), BLURRED, 0.0)
+    return xp.where(xp.isfinite(cost), cost, np.inf)
 
 
 def _faults(
-    estimate: Estimate,
+    chi2: Float[AnyArray, ""],
+    rrse: Float[AnyArray, ""],
+    settled: Bool[AnyArray, ""],
     calibration: Calibration,
-    passive: Bool[Array, ""],
-    terms: Float[Array, ""],
-    missing_pole: Float[Array, ""] | None = None,
-) -> list[tuple[Bool[Array, ""], RESULTS]]:
+    passive: Bool[AnyArray, ""],
+    terms: Float[AnyArray, ""],
+    missing_pole: Float[AnyArray, ""] | None = None,
+) -> list[tuple[Bool[AnyArray, ""], RESULTS]]:
     """What is wrong with a driver, the worst first."""
-    settled = estimate.result == optx.RESULTS.successful
-    wrong = jnp.array(False)
+    xp = namespace(chi2)
+    wrong = xp.bool_(False)
     if calibration.mismatch is not None:
-        wrong = of_calibrations.disagree(calibration.mismatch, estimate.chi2, terms)
+        wrong = of_calibrations.disagree(calibration.mismatch, chi2, terms)
     if calibration.across is not None and missing_pole is not None:
-        of = calibration.across, estimate.chi2, terms
-        wrong |= of_calibrations.bridged(*of, missing_pole)
+        wrong = wrong | of_calibrations.bridged(calibration.across, chi2, terms, missing_pole)
+    late = (xp.abs(calibration.delay_samples) > 1).any()  # the model holds up to one sample
     return [
-        (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
+        (~xp.isfinite(chi2), RESULTS.unstable),
         (wrong, RESULTS.resistors_disagree),
         (~passive, RESULTS.nonphysical),
         (~settled, MAX_STEPS_REACHED),
-        (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
+        (misses(chi2, rrse) | late, RESULTS.misfit),
     ]

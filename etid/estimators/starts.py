@@ -8,9 +8,10 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.harmonic_start import start_of_skin
 from etid.estimators.unknowns import LoadUnknowns
+from etid.precision import array_function, namespace
 from etid.results.driver import SourceImpedance
 from etid.signals.harmonics import Spectrum, signal_share
-from etid.signals.transfer import frequency_variable, poles, power
+from etid.signals.transfer import AnyArray, frequency_variable, poles, power
 
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels of the starts of a circuit
 # Starts of Z_th: frequency, relative to the sample rate, and damping ratio of two sections.
@@ -91,11 +92,12 @@ def harmonic_starts(
     return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(delay))
 
 
+@array_function
 def source_starts(
-    baseline: Float[Array, " a"],
+    baseline: Float[AnyArray, " a"],
     order: int,
-    sample_rate: Float[Array, ""],
-    r_load: Float[Array, ""],
+    sample_rate: Float[AnyArray, ""],
+    r_load: Float[AnyArray, ""],
 ) -> SourceImpedance:
     """Starts of Z_th, stacked: three generic ones, and one with the resonance of the baseline.
 
@@ -103,34 +105,32 @@ def source_starts(
     gains have the size of a tenth of the known resistor. The baseline is the denominator of a
     discrete Z_th.
     """
-    sections = (order - 1) // 2
+    xp, sections = namespace(baseline, sample_rate, r_load), (order - 1) // 2
     reals = order - 2 * sections
     # Further sections start overdamped at the edge of the sampled band.
     pairs = dict.fromkeys((*of, *[FAR] * sections)[:sections] for of in GENERIC)
-    places = jnp.asarray(np.reshape([*pairs], (len(pairs), sections, 2)))
+    places = np.reshape([*pairs], (len(pairs), sections, 2))
     if sections:
-        s = jnp.log(poles(baseline))  # s / fs of the discrete poles
+        s = xp.log(poles(baseline))  # s / fs of the discrete poles
         # Resonances are poles well inside the band. The least damped one is used.
-        resonant = (s.imag > 0.05) & (s.imag < 0.9 * jnp.pi) & (s.real < 0)
-        damping = jnp.where(resonant, -s.real / jnp.abs(s), jnp.inf)
-        found = jnp.argsort(damping)[0]
-        usable = jnp.isfinite(damping[found])
-        omega = jnp.where(usable, jnp.abs(s[found]) / (2 * jnp.pi), 0.1)
-        zeta = jnp.where(usable, damping[found], 0.3)
-        further = jnp.asarray(np.tile(FAR, (sections, 1)))
-        places = jnp.concatenate([places, further.at[0].set(jnp.stack([omega, zeta]))[None]])
-    turn, small = 2 * jnp.pi * sample_rate, 0.1 * r_load
-    slow = jnp.array([3e-4] + [0.5] * (reals - 1))
-
-    def start(places: Float[Array, "section 2"]) -> SourceImpedance:
-        return SourceImpedance(
-            log_resistance=jnp.log(0.05 * small),
-            log_omega=jnp.log(places[:, 0] * turn),
-            log_zeta=jnp.log(places[:, 1]),
-            gain=jnp.full(sections, small),
-            slope=jnp.full(sections, small),
-            log_omega_real=jnp.log(slow * turn),
-            gain_real=jnp.full(reals, -0.5 * small),
-        )
-
-    return jax.vmap(start)(places)
+        resonant = (s.imag > 0.05) & (s.imag < 0.9 * np.pi) & (s.real < 0)
+        damping = xp.where(resonant, -s.real / xp.abs(s), np.inf)
+        found = xp.argmin(damping)
+        usable = xp.isfinite(damping[found])
+        omega = xp.where(usable, xp.abs(s[found]) / (2 * np.pi), 0.1)
+        zeta = xp.where(usable, damping[found], 0.3)
+        own = xp.concatenate([xp.stack([omega, zeta])[None], np.tile(FAR, (sections - 1, 1))])
+        places = xp.concatenate([places, own[None]])
+    turn, small = 2 * np.pi * sample_rate, 0.1 * r_load
+    slow = np.array([3e-4] + [0.5] * (reals - 1))
+    count = len(places)
+    each = xp.zeros((count, sections)) + small
+    return SourceImpedance(
+        log_resistance=xp.zeros(count) + xp.log(0.05 * small),
+        log_omega=xp.log(places[..., 0] * turn),
+        log_zeta=xp.log(xp.asarray(places[..., 1])),
+        gain=each,
+        slope=each,
+        log_omega_real=xp.zeros((count, reals)) + xp.log(slow * turn),
+        gain_real=xp.zeros((count, reals)) - 0.5 * small,
+    )

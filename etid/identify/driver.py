@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from etid.circuits.display import rounded
 from etid.estimators.estimator import AbstractEstimator, serving
 from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.registry import Method
-from etid.estimators.score_tests import of_calibrations
 from etid.identify import changes
 from etid.identify.arguments import check_alike, check_distinct, recordings
 from etid.identify.fitting import better_of, checksum, may_hum
@@ -40,6 +40,10 @@ from etid.results.verdicts import message, verdict
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 from etid.signals.harmonics import Spectrum
 from etid.signals.knots import above_noise, banded
+
+# Factor by which rough values of |Z_th| may differ between resistors. At low frequency Z_th is real
+# to a few per cent.
+ROUGHLY = 3.0
 
 Lane = TypeVar("Lane", Harmonics, AlignedSamples)
 
@@ -112,8 +116,8 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     seen = [Inspected(record) for record in records]
     for one in seen:
         _refused(one, preflight(one, periodic=asked is not None and asked.lane.periodic))
-    rough = [of_calibrations.rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
-    if max(rough) > of_calibrations.ROUGHLY * min(rough):
+    rough = [_rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
+    if max(rough) > ROUGHLY * min(rough):
         shown = ", ".join(
             f"{one.recording.path!r} {rounded(z / 1e3, 3)} kΩ"
             for one, z in zip(seen, rough, strict=True)
@@ -158,6 +162,12 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     if throw and driver.verdict != "successful":
         raise IdentificationError(f"driver: {driver.verdict}. {driver.note}", driver)
     return driver
+
+
+def _rough_impedance(calibration: Inspected, r_load: float) -> float:
+    """Rough |Z_th| [Ω] from a resistor [Ω] and the amplitudes of both records."""
+    x, y = (v - v.mean() for v in calibration.aligned)
+    return r_load * abs(float(x @ x / (y @ x)) - 1)
 
 
 def _refused(seen: Inspected, name: str | None) -> None:
@@ -219,7 +229,7 @@ def _aligned(
     instrument: Instrument | None,
 ) -> Driver:
     """The driver from calibrations that passed the pre-flight, aligned by their lags."""
-    r_load = jax.device_put(np.asarray([one.recording.r_load for one in seen]))
+    r_load = np.array([one.recording.r_load for one in seen], float)
     records = _lanes(seen, Harmonics) if estimator.lane.periodic else _lanes(seen, AlignedSamples)
     driver = _identified(records, r_load, order, estimator, instrument)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
@@ -252,16 +262,28 @@ def with_harmonics(driver: ContinuousDriver, calibrations: Sequence[Recording]) 
     return HarmonicDriver(**own, spectra=spectra, missing_pole=jax.device_put(np.nan))
 
 
-@program
 def _clear(records: Harmonics) -> Spectrum:
     """The harmonics that a driver is refined with."""
-    return above_noise(records.spectrum, banded(records.spectrum))
+    spectrum = jax.tree.map(np.asarray, records.spectrum)
+    return jax.device_put(above_noise(spectrum, banded(spectrum)))
+
+
+def _identified(
+    lanes: AlignedSamples | Harmonics,
+    r_load: Float[np.ndarray, " record"],
+    order: int,
+    estimator: AbstractEstimator,
+    instrument: Instrument | None,
+) -> Driver:
+    if isinstance(estimator, MaximumLikelihood):
+        return jax.device_put(estimator.fit_driver(lanes, r_load, order, instrument))
+    return _traced(lanes, r_load, order, estimator, instrument)
 
 
 @program
-def _identified(
+def _traced(
     lanes: AlignedSamples | Harmonics,
-    r_load: Float[Array, " record"],
+    r_load: Float[Array | np.ndarray, " record"],
     order: int,
     estimator: AbstractEstimator,
     instrument: Instrument | None,

@@ -36,7 +36,6 @@ from etid.estimators.lanes import (
     unstacked,
 )
 from etid.estimators.maximum_likelihood import given_driver
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
@@ -63,6 +62,7 @@ from etid.identify.options import (
 )
 from etid.identify.planning import Refusal, batches, failed_fit
 from etid.identify.study import Drivers, common_first, fields_of, table
+from etid.likelihood.calibrations import Calibrations
 from etid.numpy_tier.tiers import program, worth_compiling
 from etid.precision import in_float64
 from etid.recordings.errors import RecordingError
@@ -158,15 +158,14 @@ def _together(
         fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)
         return judgement.unless(fit, found.other, RESULTS.misfit)
 
-    of_driver = model.calibrations.named(common)
-    kept = of_driver.source.size
+    kept = model.calibrations.parameters(common).size
     better = eqx.tree_at(
         lambda d: (d.source, d.cov, d.calibration.delay_samples, d.result),
         driver,
         (
             model.calibrations.source_of(common),
             cov[:kept, :kept],
-            of_driver.delay_samples,
+            model.calibrations.delays(common),
             RESULTS.where(
                 found[0].estimate.strain[0] > judgement.STRAINED,
                 RESULTS.inconsistent,

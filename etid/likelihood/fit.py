@@ -8,19 +8,18 @@ from jaxtyping import Bool, Float, Int
 
 from etid.circuits.directions import DIRECTIONS, ON_LOADS, SEEN, named, scored
 from etid.likelihood import scores
-from etid.likelihood.arrays import array_function
+from etid.likelihood.gains import FAULTS
 from etid.likelihood.linear import diagonal, inverse
 from etid.likelihood.noise import excess, shows_hum
 from etid.likelihood.scores import Linear, Scores
 from etid.likelihood.search import Load, minimum
 from etid.likelihood.source import Errors
-from etid.precision import namespace
+from etid.precision import array_function, namespace
 from etid.results.fit import Support
 from etid.results.instrument import BUDGETED, LATER, Effects
 from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex, power
 
-FAULTS = len(ON_LOADS)  # errors of the instrument that act on a load
 DOUBTED = 2.5  # standard deviations of a gain that goes into ±; one good recording in 80 has them
 GAIN = 0.02  # standard deviation of the gain between two channels that nobody compared
 NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
@@ -94,7 +93,7 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
     # All noise is that of a recording alone, or that of its outputs if V_th is shared.
     private = noise if load.unloaded is None else noise * records.variance_y / profile.expected
     values = xp.stack([xp.broadcast_to(share[..., None, :], noise.shape), noise, private], -3)
-    means = condensed.means(profile, every, values)
+    means = condensed.means([profile], every, values)
     mean_noise, mean_private = means[..., 1, :], means[..., 2, :]
     precision = 1 / load.width**2
     spread = _block(precision[:owned], source.cov)

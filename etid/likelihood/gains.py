@@ -26,6 +26,8 @@ from etid.likelihood.source import Source
 from etid.precision import namespace
 from etid.signals.transfer import AnyArray, as_complex, frequency_variable, reciprocal, turns
 
+FAULTS = len(ON_LOADS)  # errors of the instrument that act on a load
+
 _Numbers = Complex[AnyArray, "*row bin"]
 
 

@@ -1,34 +1,71 @@
 """Least squares near a point, for rows: steps, inverses, and Levenberg-Marquardt on a few terms.
 
 All matrices are scaled to a unit diagonal before they are solved, because the parameters of a fit
-have different units (Moré 1978).
+have different units. In a search the scale is the largest diagonal so far (Moré 1978).
+
+In a curved valley steps can follow its curvature: with the second derivative r″ of the residual
+along a step, half of the step that r″ alone would cause is added (Transtrum and Sethna 2012,
+arXiv:1201.5885).
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from etid.precision import namespace
 from etid.signals.transfer import AnyArray
 
 RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
 SMALLEST = 1e-12  # the same for an inverse
+GOOD = 0.75  # of the reduction that a step promises, from which on the next is damped less
+LEAST = 1e-12  # damping after a step that failed, at least
+ACCELERATION = 0.75  # largest second-order part relative to the step (Transtrum and Sethna)
+DIFFERENCE = 0.1  # of a step, for its second derivative (ibid.)
 
 
 class NormalEquations(NamedTuple):
-    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r."""
+    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r.
+
+    Attributes:
+        objective: ½|r|².
+        gradient: Jᵀr.
+        matrix: JᵀJ.
+        terms: r; None if no step asks for its curvature.
+        rows: Jᵀ; None in the same case.
+    """
 
     objective: Float[AnyArray, "*row"]
     gradient: Float[AnyArray, "*row q"]
     matrix: Float[AnyArray, "*row q q"]
+    terms: Float[AnyArray, "*row term"] | None = None
+    rows: Float[AnyArray, "*row q term"] | None = None
 
-    def step(self, damping: Float[AnyArray, "*row"] | float = 0.0) -> Float[AnyArray, "*row q"]:
-        """−(JᵀJ + damping · D)⁻¹ Jᵀr, where D is the diagonal of JᵀJ."""
-        xp = namespace(self.matrix)
-        scale = _scale(self.matrix)
+    @classmethod
+    def of(
+        cls, terms: Float[AnyArray, "*row term"], rows: Float[AnyArray, "*row q term"]
+    ) -> "NormalEquations":
+        """Those of terms and of their derivatives; infinite if one of them is not finite."""
+        xp = namespace(terms)
+        objective, gradient = 0.5 * (terms**2).sum(-1), (rows @ terms[..., None])[..., 0]
+        finite = xp.isfinite(objective) & xp.isfinite(gradient).all(-1)
+        objective = xp.where(finite, objective, np.inf)
+        return cls(objective, gradient, rows @ rows.swapaxes(-1, -2), terms, rows)
+
+    @property
+    def scale(self) -> Float[AnyArray, "*row q"]:
+        """Roots of the diagonal of JᵀJ; 1 where it is 0."""
+        return _scale(self.matrix)
+
+    def step(
+        self,
+        damping: Float[AnyArray, "*row"] | float = 0.0,
+        scale: Float[AnyArray, "*row q"] | None = None,
+    ) -> Float[AnyArray, "*row q"]:
+        """−(JᵀJ + damping · D²)⁻¹ Jᵀr, where D is the scale."""
+        xp, scale = namespace(self.matrix), self.scale if scale is None else scale
         ridge = xp.asarray(damping + RIDGE)[..., None, None] * np.eye(scale.shape[-1])
         scaled = self.matrix / scale[..., :, None] / scale[..., None, :] + ridge
         return -xp.linalg.solve(scaled, (self.gradient / scale)[..., None])[..., 0] / scale
@@ -63,25 +100,37 @@ class State(NamedTuple):
     Attributes:
         q: The best point.
         equations: The normal equations there.
+        scale: Largest scale of them so far.
         damping: Damping of the next step, relative to the diagonal.
+        idle: Steps in a row that have not reduced the objective by more than is enough.
         move: The next step.
         moves: Whether it is taken.
+        steps: Number of steps.
     """
 
     q: Float[AnyArray, "*row q"]
     equations: NormalEquations
+    scale: Float[AnyArray, "*row q"]
     damping: Float[AnyArray, "*row"]
+    idle: Int[AnyArray, "*row"]
     move: Float[AnyArray, "*row q"]
     moves: Bool[AnyArray, "*row"]
+    steps: Int[AnyArray, "*row"]
+
+
+Equations = Callable[[Float[AnyArray, "*row q"]], NormalEquations]
+Terms = Callable[[Float[AnyArray, "*row q"]], Float[AnyArray, "*row term"]]
 
 
 def levenberg_marquardt(
-    equations: Callable[[Float[AnyArray, "*row q"]], NormalEquations],
+    equations: Equations,
     start: Float[AnyArray, "*row q"],
     first: NormalEquations,
     damping: float,
     enough: Float[AnyArray, "*row"],
     steps: int,
+    patience: int = 1,
+    curved: Terms | None = None,
 ) -> State:
     """The minimum of a few terms.
 
@@ -90,44 +139,75 @@ def levenberg_marquardt(
         start: The first point.
         first: The normal equations there.
         damping: Damping of the first step.
-        enough: Reduction of the objective by the next step, below which a row is at its minimum.
+        enough: Reduction of the objective by a step, below which a row may be at its minimum.
         steps: Largest number of steps.
+        patience: So many such steps in a row end the search; the last is not taken.
+        curved: The terms at a point, if steps are to follow their curvature.
     """
     xp = namespace(start)
 
-    def proposed(
-        q: Float[AnyArray, "*row q"],
-        equations: NormalEquations,
-        damping: Float[AnyArray, "*row"],
-        moves: Bool[AnyArray, "*row"],
-    ) -> State:
-        move = equations.step(damping)
-        return State(q, equations, damping, move, moves & (equations.promised(move) > enough))
+    def proposed(state: State) -> State:
+        at = state.equations
+        scale = xp.maximum(state.scale, at.scale)
+        move = at.step(state.damping, scale)
+        ends = state.idle + (at.promised(move) <= enough) >= patience
+        moves = state.moves & ~ends
+        if curved is not None:
+            bent = at._replace(gradient=_bend(curved, state.q, at, move))
+            turned = 0.5 * bent.step(state.damping, scale)
+            sizes = [xp.sqrt(((one * scale) ** 2).sum(-1)) for one in (turned, move)]
+            small = 4 * sizes[0] <= ACCELERATION * sizes[1]
+            move = move + xp.where(small[..., None], turned, 0.0)
+        return state._replace(scale=scale, move=move, moves=moves)
 
     def step(state: State) -> State:
         trial = xp.where(state.moves[..., None], state.q + state.move, state.q)
         new, old = equations(trial), state.equations
+        promised, reduced = old.promised(state.move), old.objective - new.objective
         finite = xp.isfinite(new.gradient).all(-1)
-        better = state.moves & finite & (new.objective <= old.objective)
-        damping = xp.where(better, state.damping * 0.2, xp.maximum(state.damping, 1e-6) * 10)
+        better = state.moves & finite & (reduced >= 0)
+        good = better & (reduced >= GOOD * promised)
+        damping = xp.where(better, state.damping, xp.maximum(state.damping, LEAST) * 4)
+        damping = xp.where(good, 0.2 * state.damping, damping)
+        small = xp.maximum(promised, reduced) <= enough
+        idle = xp.where(better, xp.where(small, state.idle + 1, 0), state.idle)
         q, *kept = chosen(better, (trial, *new), (state.q, *old))
-        return proposed(q, NormalEquations(*kept), damping, state.moves)
+        count = state.steps + state.moves
+        found = state._replace(q=q, damping=damping, idle=idle, steps=count)
+        return proposed(found._replace(equations=NormalEquations(*kept)))
 
-    damped, finite = xp.full_like(first.objective, damping), xp.isfinite(first.objective)
-    return repeated(step, proposed(start, first, damped, finite), steps)
+    none = xp.zeros_like(first.objective)
+    of = xp.zeros_like(start), none + damping, xp.zeros(none.shape, int), start
+    finite, counted = xp.isfinite(first.objective), xp.zeros(none.shape, int)
+    return repeated(step, proposed(State(start, first, *of, finite, counted)), steps)
+
+
+def _bend(
+    terms: Terms,
+    q: Float[AnyArray, "*row q"],
+    at: NormalEquations,
+    move: Float[AnyArray, "*row q"],
+) -> Float[AnyArray, "*row q"]:
+    """Jᵀ r″ along a step."""
+    assert at.rows is not None
+    slope = (at.rows * move[..., :, None]).sum(-2)
+    bent = 2 / DIFFERENCE * ((terms(q + DIFFERENCE * move) - at.terms) / DIFFERENCE - slope)
+    return (at.rows @ bent[..., None])[..., 0]
 
 
 def chosen(
     rows: Bool[AnyArray, "*row"], new: Sequence[AnyArray], old: Sequence[AnyArray]
 ) -> list[AnyArray]:
-    """Arrays of `new` in these rows, of `old` in the others."""
-    xp = namespace(rows)
-    of = zip(new, old, strict=True)
-    return [xp.where(rows.reshape(rows.shape + (1,) * (a.ndim - rows.ndim)), a, b) for a, b in of]
+    """Arrays of `new` in these rows, of `old` in the others; None stays None."""
+    xp, found = namespace(rows), []
+    for a, b in zip(new, old, strict=True):
+        wide = None if a is None else rows.reshape(rows.shape + (1,) * (a.ndim - rows.ndim))
+        found.append(None if a is None else xp.where(wide, a, b))
+    return found
 
 
-def repeated(step: Callable[[State], State], state: State, steps: int) -> State:
-    """Steps until no row moves: a loop of Python for NumPy, one of JAX for JAX."""
+def repeated(step: Callable[[Any], Any], state: Any, steps: int) -> Any:
+    """Steps until no row `moves`: a loop of Python for NumPy, one of JAX for JAX."""
     if namespace(state.moves) is np:
         for _ in range(steps):
             if not state.moves.any():

@@ -27,13 +27,14 @@ cent of the cost of all harmonics.
 
 import functools
 import operator
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Inexact
 
 from etid.likelihood.arrays import along_outputs
-from etid.precision import namespace
+from etid.precision import array_function, namespace
 from etid.signals.harmonics import real_parts
 from etid.signals.knots import Knots
 from etid.signals.transfer import AnyArray, as_complex, power
@@ -178,11 +179,12 @@ class Condensed(NamedTuple):
     target: Complex[AnyArray, "*row output knot"]
 
     @classmethod
-    def of(cls, profile: Profile, knots: Knots) -> "Condensed":
-        """The likelihood near the gains of `profile`."""
-        xp, count = namespace(profile.x), profile.gains.shape[-2]
-        score = xp.conj(profile.x)[..., None, :] * profile.pull
-        lower = profile.information()
+    def of(cls, profiles: Sequence[Profile], knots: Knots) -> "Condensed":
+        """The likelihood near the gains of `profiles`, one for each input."""
+        xp, count = namespace(profiles[0].x), profiles[0].gains.shape[-2]
+        score = added([xp.conj(of.x)[..., None, :] * of.pull for of in profiles])
+        each = [of.information() for of in profiles]
+        lower = [[added([of[i][j] for of in each]) for j in range(i + 1)] for i in range(count)]
         real = [lower[i][i] for i in range(count)]
         mixed = [lower[i][j] for i in range(count) for j in range(i)]
         mixed += [score[..., m, :] for m in range(count)]
@@ -204,15 +206,17 @@ class Condensed(NamedTuple):
                 p[a] = [one - xp.conj(root[-1][a]) * root[-1][b] for b, one in enumerate(p[a])]
                 p[a][a] = p[a][a].real
                 score[a] = score[a] - xp.conj(root[-1][a]) * target[-1]
-        gains = profile.gains[..., knots.index]
+        gains = profiles[0].gains[..., knots.index]
         return cls(gains, root[::-1], along_outputs(target[::-1]))
 
+    @array_function
     def rows(self, changes: Complex[AnyArray, "*row change output knot"]) -> AnyArray:
         """Changes of the real terms by changes of the gains (*row change part)."""
         found = []
         for of in self.root:
-            each = [one[..., None, :] * changes[..., j, :] for j, one in enumerate(of)]
-            found.append(functools.reduce(operator.add, each))
+            found.append(
+                added([one[..., None, :] * changes[..., j, :] for j, one in enumerate(of)])
+            )
         whole = found[0] if len(found) == 1 else namespace(changes).concatenate(found, -1)
         return -real_parts(whole)
 
@@ -226,12 +230,20 @@ class Condensed(NamedTuple):
         return real_parts(self.target.reshape(*self.target.shape[:-2], -1))
 
     def means(
-        self, profile: Profile, knots: Knots, values: Float[AnyArray, "*row value output bin"]
+        self,
+        profiles: Sequence[Profile],
+        knots: Knots,
+        values: Float[AnyArray, "*row value output bin"],
     ) -> Float[AnyArray, "*row value part"]:
         """Means of values of the innovations for each real term, weighted by information."""
-        xp, size = namespace(values), profile.size[..., None, :, :]
+        xp, size = namespace(values), added([of.size for of in profiles])[..., None, :, :]
         sums = knots.summed(xp.concatenate([size, values * size], -3))
         whole, sums = sums[..., :1, :, :], sums[..., 1:, :, :]
         found = sums / xp.where(whole > 0, whole, 1.0)
         found = found.reshape(*found.shape[:-2], -1)
         return xp.concatenate([found, found], -1)
+
+
+def added(values: Sequence[AnyArray]) -> AnyArray:
+    """The sum of arrays, such as those of each input."""
+    return functools.reduce(operator.add, values)

@@ -14,12 +14,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from etid.likelihood.arrays import array_function
 from etid.likelihood.gains import Gains, Slopes
 from etid.likelihood.linear import NormalEquations, chosen, levenberg_marquardt
 from etid.likelihood.profile import Condensed, Profile, Records
 from etid.likelihood.shared import Unloaded
-from etid.precision import namespace
+from etid.precision import array_function, namespace
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import AnyArray, as_complex, reciprocal
 
@@ -119,7 +118,7 @@ class Near(NamedTuple):
             total, (real, imag) = sums[..., :1, :], xp.split(sums[..., 1:, :], 2, -2)
             by_x = (real + 1j * imag) / as_complex(xp.where(total > 0, total, 1.0))
         slopes = at_knots.slopes(q)
-        return cls(q, objective, profile, Condensed.of(profile, every), slopes, by_x)
+        return cls(q, objective, profile, Condensed.of([profile], every), slopes, by_x)
 
     def by_q(self, slopes: Slopes) -> Complex[AnyArray, "*row q output knot"]:
         """Derivatives of G X/X̂ with respect to the parameters."""

@@ -33,9 +33,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import SkinRC, impedance_at
-from etid.likelihood.arrays import array_function
 from etid.likelihood.search import Load
-from etid.precision import namespace
+from etid.precision import array_function, namespace
 from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex, power
 

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from etid.likelihood.arrays import array_function
 from etid.likelihood.noise import excess
 from etid.likelihood.profile import Records
-from etid.precision import namespace
+from etid.precision import array_function, namespace
 from etid.signals.transfer import AnyArray, as_complex, power, turns
 
 SEEN = 37.37  # χ² that all directions exceed by chance once in 10 000

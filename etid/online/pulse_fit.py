@@ -18,9 +18,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit, with_slopes
 from etid.circuits.directions import At, spread
-from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.online.gain_bands import Bands
 from etid.online.noise import cleared
 from etid.precision import Module

@@ -24,11 +24,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.estimate import delay_width
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import fed
+from etid.likelihood.source_prior import delay_width
 from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording

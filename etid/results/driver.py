@@ -92,12 +92,12 @@ class Calibration(Overviewed, Module):
             `Instrument` states]; None if they are 0.
     """
 
-    r_load: Float[Array, " record"]
-    delay_samples: Float[Array, " record"]
-    delay_std_samples: Float[Array, ""]
-    mismatch: Float[Array, "2 record"] | None = None
-    across: Float[Array, "2 record"] | None = None
-    errors: Float[Array, " error"] | None = None
+    r_load: Float[AnyArray, " record"]
+    delay_samples: Float[AnyArray, " record"]
+    delay_std_samples: Float[AnyArray, ""]
+    mismatch: Float[AnyArray, "2 record"] | None = None
+    across: Float[AnyArray, "2 record"] | None = None
+    errors: Float[AnyArray, " error"] | None = None
 
     def _overview(self) -> Overview:
         open_delay = float(self.delay_std_samples)
@@ -137,15 +137,15 @@ class Driver(AbstractFeed):
     recorded: ClassVar[str] = "v_th"
     recordings: ClassVar[Sequence[Recording]] = ()
     _: dataclasses.KW_ONLY
-    b: Float[Array, " b"]
-    a: Float[Array, " a"]
-    sample_rate: float | Float[Array, ""]
-    rrse: Float[Array, ""]
-    chi2: Float[Array, ""]
+    b: Float[AnyArray, " b"]
+    a: Float[AnyArray, " a"]
+    sample_rate: float | Float[AnyArray, ""]
+    rrse: Float[AnyArray, ""]
+    chi2: Float[AnyArray, ""]
     result: RESULTS
-    steps: Int[Array, ""]
+    steps: Int[AnyArray, ""]
     method: str = eqx.field(static=True)
-    remarks: Int[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: np.zeros((), int))
+    remarks: Int[AnyArray, ""] = eqx.field(default_factory=lambda: np.zeros((), int))
 
     @property
     def order(self) -> int:
@@ -288,11 +288,11 @@ class ContinuousDriver(Driver):
 
     _: dataclasses.KW_ONLY
     source: SourceImpedance
-    cov: Float[Array, "parameter parameter"]
+    cov: Float[AnyArray, "parameter parameter"]
     calibration: Calibration
     instrument: Instrument | None = None
     tried: OrderEvidence = eqx.field(default_factory=OrderEvidence.none)
-    start: Int[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: np.array(0))
+    start: Int[AnyArray, ""] = eqx.field(default_factory=lambda: np.array(0))
 
     @property
     def drift(self) -> Float[Array | np.ndarray, ""] | None:
@@ -382,10 +382,10 @@ class HarmonicDriver(ContinuousDriver):
             with another checksum shares no unloaded record with them. Its fit then skips the
             search for what they share, which doubles the cost.
         missing_pole: Largest score statistic of one more section
-            (`etid.estimators.score_tests.of_calibrations`).
+            (`etid.likelihood.of_calibrations`).
     """
 
     _: dataclasses.KW_ONLY
     spectra: Spectrum
-    missing_pole: Float[Array, ""]
-    unloaded: Int[np.ndarray, " record"] | None = None
+    missing_pole: Float[AnyArray, ""]
+    unloaded: Int[AnyArray, " record"] | None = None

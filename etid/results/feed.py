@@ -17,7 +17,6 @@ import abc
 import dataclasses
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
@@ -26,8 +25,9 @@ from etid.circuits.impedance import Quantity, realise
 from etid.circuits.overview import Overview
 from etid.precision import Module, in_float64, namespace, untraced
 from etid.results.verdicts import RESULTS, Judged, verdict
+from etid.signals import modal
 from etid.signals.filtering import StateSpace
-from etid.signals.transfer import AnyArray, Rational, as_complex, from_parts
+from etid.signals.transfer import AnyArray, Rational
 
 Load = Complex[Array, "..."] | Complex[np.ndarray, "..."]
 """Type of the impedance of a load [Ω]."""
@@ -72,76 +72,44 @@ class SourceImpedance(Module):
     inductance.
     """
 
-    log_resistance: Float[Array, ""]
-    log_omega: Float[Array, " section"]
-    log_zeta: Float[Array, " section"]
-    gain: Float[Array, " section"]
-    slope: Float[Array, " section"]
-    log_omega_real: Float[Array, " real"]
-    gain_real: Float[Array, " real"]
+    log_resistance: Float[AnyArray, "*row"]
+    log_omega: Float[AnyArray, "*row section"]
+    log_zeta: Float[AnyArray, "*row section"]
+    gain: Float[AnyArray, "*row section"]
+    slope: Float[AnyArray, "*row section"]
+    log_omega_real: Float[AnyArray, "*row real"]
+    gain_real: Float[AnyArray, "*row real"]
 
     @property
     def order(self) -> int:
         """Number of poles."""
         return 2 * self.log_omega.shape[0] + self.log_omega_real.shape[0]
 
+    def vector(self) -> Float[AnyArray, "*row parameter"]:
+        """All parameters in field order, of one source or of several that are stacked."""
+        first, *rest = untraced([getattr(self, one.name) for one in dataclasses.fields(self)])
+        return namespace(first, *rest).concatenate([first[..., None], *rest], -1)
+
+    def of_vector(self, vector: Float[AnyArray, " parameter"]) -> "SourceImpedance":
+        """A source of the same order with these parameters."""
+        pairs = self.log_omega.shape[0]
+        ends = np.cumsum([1, *[pairs] * modal.SECTION, self.log_omega_real.shape[0]])
+        first, *rest = (vector[a:b] for a, b in zip([0, *ends], [*ends, None], strict=True))
+        return SourceImpedance(first[0], *rest)
+
     @in_float64
-    @np.errstate(all="ignore")  # parameters of a driver that failed may be any numbers
     def response(self, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """Impedance [Ω] at real frequencies [Hz], an array of NumPy unless JAX traces it."""
-        of, frequency = untraced((self, frequency))
-        xp = namespace(of.gain, frequency)
-        # In real arithmetic, which takes half the time to compile and to run.
-        omega = 2 * np.pi * xp.asarray(frequency, float)[None]
+        of, at = self.vector(), untraced(frequency)
+        at = namespace(of, at).asarray(at, float)
+        found = modal.impedance(of, self.log_omega.shape[0], at.reshape(-1))
+        return found.reshape(at.shape)
 
-        def each(values: Float[AnyArray, " pole"]) -> Float[AnyArray, "pole ..."]:
-            return values.reshape(-1, *[1] * (omega.ndim - 1))
-
-        turn = omega * each(xp.exp(-of.log_omega))
-        below, damped = 1 - turn * turn, 2 * each(xp.exp(of.log_zeta)) * turn
-        scale = 1 / (below * below + damped * damped)
-        gain, slope = each(of.gain) * scale, each(of.slope) * turn * scale
-        turn_real = omega * each(xp.exp(-of.log_omega_real))
-        gain_real = each(of.gain_real) / (1 + turn_real * turn_real)
-        real = [gain * below + slope * damped, gain_real]
-        imaginary = [slope * below - gain * damped, -gain_real * turn_real]
-        real, imaginary = (xp.concatenate(one).sum(0) for one in (real, imaginary))
-        return from_parts(xp.exp(of.log_resistance) + real, imaginary)
-
-    @jax.jit  # JAX remembers its trace
     def with_slopes(
-        self, frequency: Float[Array, " frequency"]
-    ) -> tuple[Complex[Array, " frequency"], Complex[Array, "parameter frequency"]]:
+        self, frequency: Float[AnyArray, " frequency"]
+    ) -> tuple[Complex[AnyArray, " frequency"], Complex[AnyArray, "parameter frequency"]]:
         """`response`, and its derivatives with respect to the parameters, in field order."""
-        omega = 2 * jnp.pi * frequency[None, :]
-        gain, slope, gain_real = (
-            as_complex(of)[:, None] for of in (self.gain, self.slope, self.gain_real)
-        )
-        # 1 / (1 + 2ζx + x²) in real arithmetic, which takes half the time.
-        turn = omega * jnp.exp(-self.log_omega)[:, None]
-        damping = 2 * jnp.exp(self.log_zeta)[:, None]
-        real, imaginary = 1 - turn * turn, damping * turn
-        scale = 1 / (real * real + imaginary * imaginary)
-        shape = jax.lax.complex(real * scale, -imaginary * scale)
-        x, damping = jax.lax.complex(jnp.zeros_like(turn), turn), as_complex(damping)
-        section = (gain + slope * x) * shape
-        turn = omega * jnp.exp(-self.log_omega_real)[:, None]
-        scale = 1 / (1 + turn * turn)
-        shape_real = jax.lax.complex(scale, -turn * scale)
-        constant = as_complex(jnp.full((1, frequency.size), jnp.exp(self.log_resistance)))
-        single = gain_real * shape_real
-        by_omega_real = jax.lax.complex(jnp.zeros_like(turn), turn) * shape_real
-        slopes = [
-            constant,
-            (section * (damping + 2 * x) - slope) * x * shape,
-            -section * damping * x * shape,
-            shape,
-            x * shape,
-            single * by_omega_real,
-            shape_real,
-        ]
-        parts = jnp.concatenate([constant, section, single])
-        return jnp.sum(parts, axis=0), jnp.concatenate(slopes)
+        return modal.with_slopes(self.vector(), self.log_omega.shape[0], untraced(frequency))
 
     @property
     def log_omegas(self) -> Int[np.ndarray, " pole"]:

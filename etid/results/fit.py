@@ -17,7 +17,7 @@ from etid.circuits.circuit import Circuit
 from etid.circuits.directions import ALIKE, DIRECTIONS, FAST, SPREAD, Direction, named
 from etid.circuits.display import quality, quantity, rounded, several
 from etid.circuits.overview import Overview, element_rows
-from etid.precision import Module
+from etid.precision import Module, namespace
 from etid.recordings.remarks import texts, words
 from etid.results.data import HasSource
 from etid.results.instrument import Effects, largest
@@ -39,13 +39,14 @@ def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> F
 
 
 def complex_rrse(
-    predicted: Complex[Array, " value"],
-    measured: Complex[Array, " value"],
-    used: Bool[Array, " value"] | bool = True,
-) -> Float[Array, ""]:
+    predicted: Complex[AnyArray, "*row value"],
+    measured: Complex[AnyArray, "*row value"],
+    used: Bool[AnyArray, "*row value"] | bool = True,
+) -> Float[AnyArray, "*row"]:
     """RRSE of the harmonics or impedances that are used; their mean is not subtracted."""
-    missed = jnp.sum(jnp.where(used, power(measured - predicted), 0.0))
-    return jnp.sqrt(missed / jnp.sum(jnp.where(used, power(measured), 0.0)))
+    xp = namespace(predicted, measured)
+    missed = xp.where(used, power(measured - predicted), 0.0).sum(-1)
+    return xp.sqrt(missed / xp.where(used, power(measured), 0.0).sum(-1))
 
 
 class IdentificationError(RuntimeError):

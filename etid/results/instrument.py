@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -85,10 +84,12 @@ class Instrument(Module):
                 raise ValueError(f"{part!r} is no number; write {name}=1e-3") from None
         return cls(**found)
 
-    def deviations(self, resistors: int) -> Float[Array, " error"]:
+    def deviations(self, resistors: int) -> Float[AnyArray, " error"]:
         """Standard deviations of `ON_LOADS`, then each of `OF_RESISTORS` of each known resistor."""
         each = *ON_LOADS, *(name for name in OF_RESISTORS for _ in range(resistors))
-        return jnp.stack([jnp.asarray(getattr(self, name)) for name in each])
+        told = [getattr(self, name) for name in each]
+        xp = namespace(*told)
+        return xp.stack([xp.asarray(one, float) for one in told])
 
     def budgeted(self) -> Float[AnyArray, " error"]:
         """The tolerance of each of `BUDGETED`; 0 if none is stated."""
@@ -99,8 +100,8 @@ class Instrument(Module):
 
     def complete(self: _Kind) -> _Kind:
         """The same with the size in `BUDGETED` for each error that nobody stated."""
-        own = {name: jnp.asarray(getattr(self, name)) for name in ERRORS}
-        sizes = {name: jnp.where(of > 0, of, ERRORS[name]) for name, of in own.items()}
+        own = {name: getattr(self, name) for name in ERRORS}
+        sizes = {name: namespace(of).where(of > 0, of, ERRORS[name]) for name, of in own.items()}
         return dataclasses.replace(self, **sizes)
 
     def narrow(self: _Kind) -> _Kind:

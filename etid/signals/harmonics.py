@@ -56,12 +56,12 @@ class Spectrum(Module):
         selected: Harmonics that are used; all of them if aliases fall between them.
     """
 
-    frequency: Float[Array, "*lane harmonic"]
-    x: Complex[Array, "*lane harmonic"]
-    y: Complex[Array, "*lane harmonic"]
-    variance_x: Float[Array, "*lane harmonic"]
-    variance_y: Float[Array, "*lane harmonic"]
-    selected: Bool[Array, "*lane harmonic"]
+    frequency: Float[AnyArray, "*lane harmonic"]
+    x: Complex[AnyArray, "*lane harmonic"]
+    y: Complex[AnyArray, "*lane harmonic"]
+    variance_x: Float[AnyArray, "*lane harmonic"]
+    variance_y: Float[AnyArray, "*lane harmonic"]
+    selected: Bool[AnyArray, "*lane harmonic"]
 
 
 def same_unloaded(

@@ -24,11 +24,11 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Inexact, Int
+from jaxtyping import Float, Inexact, Int
 
-from etid.precision import namespace
+from etid.precision import array_function, namespace
 from etid.signals.harmonics import ABSENT, Spectrum
-from etid.signals.transfer import AnyArray, as_complex, power
+from etid.signals.transfer import AnyArray, as_complex, from_parts, power
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,37 +145,36 @@ def _bands(harmonics: int) -> Int[np.ndarray, " harmonic"]:
     return np.asarray(band[:harmonics])
 
 
+@array_function
 def banded(spectrum: Spectrum) -> Spectrum:
     """The harmonics of each recording, summed over bands; selected where X exceeds its noise."""
-    band = _bands(spectrum.frequency.shape[-1])
+    xp, band = namespace(spectrum.x), _bands(spectrum.frequency.shape[-1])
+    first = np.flatnonzero(np.diff(band, prepend=-1))
 
-    def summed(values: Float[Array, "*lane harmonic"]) -> Float[Array, "*lane band"]:
-        zero = jnp.zeros((*values.shape[:-1], int(band[-1]) + 1))
-        return zero.at[..., band].add(jnp.where(spectrum.selected, values, 0.0))
+    def summed(values: Float[AnyArray, "*lane harmonic"]) -> Float[AnyArray, "*lane band"]:
+        return xp.add.reduceat(xp.where(spectrum.selected, values, 0.0), first, axis=-1)
 
-    count, size = summed(jnp.ones_like(spectrum.variance_x)), summed(power(spectrum.x))
+    count, size = summed(xp.ones_like(spectrum.variance_x)), summed(power(spectrum.x))
     signal = size - summed(spectrum.variance_x)
     present = signal > size / 2  # half of |X|² is signal; False where no harmonic is selected
-    signal, size = (jnp.where(present, sums, 1.0) for sums in (signal, size))
-    level, product = jnp.sqrt(signal), jnp.conj(spectrum.x) * spectrum.y
+    signal, size = (xp.where(present, sums, 1.0) for sums in (signal, size))
+    level, product = xp.sqrt(signal), xp.conj(spectrum.x) * spectrum.y
 
     def filled(
-        values: Float[Array, "*lane band"], absent: Array | float
-    ) -> Float[Array, "*lane band"]:
-        return jnp.where(present, values, absent)
+        values: Float[AnyArray, "*lane band"], absent: AnyArray | float
+    ) -> Float[AnyArray, "*lane band"]:
+        return xp.where(present, values, absent)
 
-    def variance(values: Float[Array, "*lane harmonic"]) -> Float[Array, "*lane band"]:
-        return filled(summed(values) / jnp.maximum(count, 1.0) * size / signal, ABSENT)
+    def variance(values: Float[AnyArray, "*lane harmonic"]) -> Float[AnyArray, "*lane band"]:
+        return filled(summed(values) / xp.maximum(count, 1.0) * size / signal, ABSENT)
 
     # Every band needs a frequency, and these grow.
-    anyhow = spectrum.frequency[..., np.flatnonzero(np.diff(band, prepend=-1))]
+    anyhow = spectrum.frequency[..., first]
+    y = summed(product.real) / level, summed(product.imag) / level
     return Spectrum(
         frequency=filled(summed(power(spectrum.x) * spectrum.frequency) / size, anyhow),
         x=as_complex(filled(level, ABSENT)),
-        y=jax.lax.complex(
-            filled(summed(product.real) / level, ABSENT),
-            filled(summed(product.imag) / level, 0.0),
-        ),
+        y=from_parts(filled(y[0], ABSENT), filled(y[1], 0.0)),
         variance_x=variance(spectrum.variance_x),
         variance_y=variance(spectrum.variance_y),
         selected=present,

@@ -95,8 +95,8 @@ class Rational(Module):
     The variable x is s [rad/s] for impedances in continuous time and z⁻¹ for discrete filters.
     """
 
-    num: Float[Array, " num"]
-    den: Float[Array, " den"]
+    num: Float[AnyArray, " num"]
+    den: Float[AnyArray, " den"]
 
     def __call__(self, x: Inexact[Array, "..."]) -> Complex[Array, "..."]:
         """Evaluate at `x`."""
@@ -178,9 +178,16 @@ def delay_variable(
     return jnp.exp(-frequency_variable(frequency / sample_rate))
 
 
-def poles(a: Float[Array, " order1"]) -> Complex[Array, " order"]:
+def poles(a: Float[AnyArray, " order1"]) -> Complex[AnyArray, " order"]:
     """Poles in z of 1 / (a[0] + a[1] z⁻¹ + …)."""
-    return jnp.roots(a, strip_zeros=False)
+    if namespace(a) is not np:
+        return jnp.roots(a, strip_zeros=False)
+    if not np.isfinite(a).all():
+        return np.full(a.size - 1, np.nan, complex)  # as JAX does
+    found = np.zeros(a.size - 1, complex)
+    roots = np.roots(a)
+    found[: roots.size] = roots
+    return found
 
 
 def is_stable(a: Float[Array, " order1"]) -> Bool[Array, ""]:

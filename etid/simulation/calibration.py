@@ -21,15 +21,15 @@ from jaxtyping import Array, Float
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.display import per_cent, rounded, several
 from etid.circuits.overview import Overview, Overviewed
-from etid.estimators.estimate import delay_std
 from etid.estimators.maximum_likelihood import given_driver
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.load_fit import inverse_information
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.identify.arguments import check_new
 from etid.identify.driver import identify_driver, with_harmonics
 from etid.identify.skins import identify_skin
+from etid.likelihood.calibrations import Calibrations
+from etid.likelihood.source_prior import delay_std
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.hdf5 import read_calibrations

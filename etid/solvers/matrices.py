@@ -11,19 +11,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from etid.precision import namespace
+from etid.signals.transfer import AnyArray
+
 SMALLEST = 1e-12  # eigenvalue of a scaled matrix; double precision resolves no smaller one
 
 
-def inverse(matrix: Float[Array, "n n"], *, drop: bool = False) -> Float[Array, "n n"]:
+def inverse(matrix: Float[AnyArray, "n n"], *, drop: bool = False) -> Float[AnyArray, "n n"]:
     """Inverse of a symmetric matrix.
 
     Directions without information get an enormous variance. With `drop` they get none: nuisance
     parameters that the data do not determine do not affect the other parameters.
     """
-    scaled, scale = _unit_diagonal(matrix)
-    values, vectors = jnp.linalg.eigh(scaled)
-    weight = 1 / jnp.maximum(values, SMALLEST)
-    weight = jnp.where(values > SMALLEST, weight, 0.0 if drop else weight)
+    xp, (scaled, scale) = namespace(matrix), _unit_diagonal(matrix)
+    if xp is np and not np.isfinite(scaled).all():
+        return np.full_like(scaled, np.nan)  # as JAX does
+    values, vectors = xp.linalg.eigh(scaled)
+    weight = 1 / xp.maximum(values, SMALLEST)
+    weight = xp.where(values > SMALLEST, weight, 0.0 if drop else weight)
     return (vectors * weight[None, :]) @ vectors.T / scale[:, None] / scale[None, :]
 
 
@@ -52,15 +57,17 @@ def root_of_few(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.stack(columns, axis=1) * scale[:, None]
 
 
-def root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def root(matrix: Float[AnyArray, "n n"]) -> Float[AnyArray, "n n"]:
     """A matrix L with L Lᵀ = M, for a positive semidefinite M."""
     factor, scale = _factor(matrix)
     return scale[:, None] * factor
 
 
-def inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def inverse_root(matrix: Float[AnyArray, "n n"]) -> Float[AnyArray, "n n"]:
     """A matrix L with L Lᵀ = M⁻¹, for a positive semidefinite M."""
     factor, scale = _factor(matrix)
+    if isinstance(factor, np.ndarray):
+        return (np.linalg.inv(factor) / scale[None, :]).T
     return jax.scipy.linalg.solve_triangular(factor, jnp.diag(1 / scale), lower=True).T
 
 
@@ -75,9 +82,9 @@ def is_definite(cov: Float[np.ndarray, "n n"]) -> bool:
     return bool(np.linalg.eigvalsh(cov / np.outer(scale, scale))[0] > SMALLEST)
 
 
-def diagonal(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
+def diagonal(matrix: Float[AnyArray, "n n"]) -> Float[AnyArray, " n"]:
     """The diagonal of a matrix; `jnp.diagonal` is traced as twenty operations."""
-    return jnp.where(np.eye(matrix.shape[0], dtype=bool), matrix, 0.0).sum(1)
+    return namespace(matrix).where(np.eye(matrix.shape[0], dtype=bool), matrix, 0.0).sum(1)
 
 
 def log_stderr(
@@ -101,15 +108,22 @@ def log_stderr(
 
 
 def _unit_diagonal(
-    matrix: Float[Array, "n n"],
-) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    matrix: Float[AnyArray, "n n"],
+) -> tuple[Float[AnyArray, "n n"], Float[AnyArray, " n"]]:
     """D⁻¹ M D⁻¹ and the diagonal of D, which is 1 where the diagonal of M is not positive."""
-    scale = jnp.sqrt(jnp.maximum(diagonal(matrix), 0.0))
-    scale = jnp.where(scale > 0, scale, 1.0)
+    xp = namespace(matrix)
+    scale = xp.sqrt(xp.maximum(diagonal(matrix), 0.0))
+    scale = xp.where(scale > 0, scale, 1.0)
     return matrix / scale[:, None] / scale[None, :], scale
 
 
-def _factor(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+def _factor(matrix: Float[AnyArray, "n n"]) -> tuple[Float[AnyArray, "n n"], Float[AnyArray, " n"]]:
     """Cholesky factor of D⁻¹ M D⁻¹ with a ridge for directions without information, and D."""
     scaled, scale = _unit_diagonal(matrix)
-    return jax.scipy.linalg.cholesky(scaled + SMALLEST * np.eye(scale.size), lower=True), scale
+    scaled = scaled + SMALLEST * np.eye(scale.size)
+    if not isinstance(scaled, np.ndarray):
+        return jax.scipy.linalg.cholesky(scaled, lower=True), scale
+    try:
+        return np.linalg.cholesky(scaled), scale
+    except np.linalg.LinAlgError:
+        return np.full_like(scaled, np.nan), scale  # as JAX does

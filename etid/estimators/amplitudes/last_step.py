@@ -29,7 +29,7 @@ from jaxtyping import Array, Complex, Float
 
 from etid.estimators.amplitudes.terms import Amplitudes
 from etid.estimators.maximum_likelihood.profile import Profile, excess
-from etid.estimators.sandwich import Curvature
+from etid.likelihood.sandwich import Curvature
 from etid.signals.harmonics import ALIASED, Spectrum, real_parts, signal_share
 from etid.signals.transfer import as_complex, power
 

@@ -2,7 +2,7 @@
 
     cov = H⁻¹ (Jᵀ C J) H⁻¹
 
-is that of `etid.estimators.sandwich`. For `common` the own parameters of the loads are eliminated.
+is that of `etid.likelihood.sandwich`. For `common` the own parameters of the loads are eliminated.
 A load inherits K cov Kᵀ with its slope K = −A⁻¹ B.
 
 **One unloaded record in several loads** has the same noise of X in all of them. The fit takes the
@@ -25,9 +25,9 @@ from etid.estimators.maximum_likelihood import load_fit
 from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import changes
-from etid.estimators.sandwich import Curvature, Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.sandwich import Curvature, Linear
 from etid.signals.harmonics import signal_share
 from etid.signals.transfer import as_complex
 from etid.solvers.matrices import inverse

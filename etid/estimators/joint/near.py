@@ -27,11 +27,12 @@ from jaxtyping import Array, Complex, Float
 
 from etid.estimators.estimate import MAX_STEPS, SOLVER
 from etid.estimators.joint.terms import Joint, Loads, in_turn
-from etid.estimators.maximum_likelihood.calibrations import DENSE, FAULTS, Calibrations
 from etid.estimators.maximum_likelihood.condensed import apart
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.likelihood.calibrations import DENSE, Calibrations
+from etid.likelihood.gains import FAULTS
 from etid.signals.knots import knots
-from etid.signals.transfer import as_complex, reciprocal
+from etid.signals.transfer import AnyArray, as_complex, reciprocal
 from etid.solvers import successive
 from etid.solvers.least_squares import stepped
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
@@ -120,7 +121,7 @@ class _Signals(eqx.Module):
     def slopes(self, common: Float[Array, " common"]) -> list[Float[Array, "common signal knot"]]:
         """Derivatives of the signals."""
         source, resistance = self.calibrations.source_of(common), self._resistance
-        known = self.calibrations.slopes(common, self.calibrations.knots).by_unknown
+        known = self.calibrations.slopes(common, self.calibrations.knots).by_q
         of_w = []
         for f in self.frequency:
             z_th, rows = source.with_slopes(f)
@@ -208,7 +209,7 @@ def _of_calibrations(calibrations: Calibrations, common: Float[Array, " common"]
 
 
 def _by_signals(
-    driver: GivenDriver, shared: bool, tolerances: Float[Array, " fault"]
+    driver: GivenDriver, shared: bool, tolerances: Float[AnyArray, " fault"]
 ) -> GivenDriver:
     """A driver whose z are the signals at each harmonic."""
     unit, own = jnp.array([1.0, 1.0j])[:, None], W + tolerances.size

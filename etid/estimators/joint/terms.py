@@ -16,11 +16,11 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.calibrations import Calibrations
 from etid.signals.harmonics import Spectrum
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step

@@ -27,12 +27,13 @@ from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.rows import fit_rows
 from etid.estimators.refined_driver import from_harmonics
 from etid.estimators.score_tests.falling_resistance import NO_FALL
-from etid.estimators.score_tests.of_calibrations import MISSING_POLE
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
+from etid.likelihood.of_calibrations import MISSING_POLE
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
+from etid.signals.transfer import AnyArray
 
 
 def description(
@@ -110,7 +111,7 @@ class MaximumLikelihood(AbstractEstimator):
     def fit_driver(
         self,
         records: Harmonics,
-        r_load: Float[Array, " record"],
+        r_load: Float[AnyArray, " record"],
         order: int,
         instrument: Instrument | None,
     ) -> Driver:

@@ -23,9 +23,9 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit, with_slopes
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.condensed import Slopes
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
 

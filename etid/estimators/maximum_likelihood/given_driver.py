@@ -45,12 +45,13 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.calibrations import FAULTS, Calibrations
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.calibrations import Calibrations
+from etid.likelihood.gains import FAULTS
+from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.precision import Module
 from etid.results.driver import HarmonicDriver
 from etid.results.instrument import BUDGETED, Instrument
@@ -321,7 +322,7 @@ def around(
     known = None
     if shared:
         of = calibrations.slopes(c)
-        gains, known = of.gains, combined(directions.T, of.by_unknown.reshape(c.size, -1))
+        gains, known = of.gains, combined(directions.T, of.by_q.reshape(c.size, -1))
         known = known.reshape(-1, *gains.shape)
     faults = None
     if calibrations.instrument is not None:

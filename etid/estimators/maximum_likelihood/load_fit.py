@@ -16,7 +16,6 @@ from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import judged, unless
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.condensed import Near, means
 from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import around
@@ -27,10 +26,12 @@ from etid.estimators.maximum_likelihood.load import (
 )
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import best_start, minimum
-from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
-from etid.likelihood.fit import FAR, FAULTS, NO_HUM, UNSEEN
+from etid.likelihood.calibrations import Calibrations
+from etid.likelihood.fit import FAR, NO_HUM, UNSEEN
+from etid.likelihood.gains import FAULTS
+from etid.likelihood.sandwich import Linear
 from etid.results.driver import HarmonicDriver
 from etid.results.fit import Fit, Support
 from etid.results.instrument import BUDGETED, LATER, Effects, Instrument

@@ -8,20 +8,20 @@ import numpy as np
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.verdict import judged
-from etid.likelihood.arrays import array_function
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import Gains, Voltage, VoltageAndCurrent
 from etid.likelihood.profile import Records
 from etid.likelihood.search import Load
 from etid.likelihood.shared import Calibrated, Unloaded
 from etid.likelihood.source import Errors, Source, Tolerances
+from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.likelihood.starts import starts
 from etid.likelihood.unloaded import differs
 from etid.numpy_tier.algebra import one_thread
+from etid.precision import array_function
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument

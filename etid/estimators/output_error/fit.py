@@ -28,14 +28,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.directions import DIRECTIONS
 from etid.circuits.elements import resistor
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.estimate import (
-    DELAY_WIDTH,
-    MAX_STEPS,
-    SOLVER,
-    Estimate,
-    delay_std,
-    prior,
-)
+from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.output_error.information import curvature, further, slopes
 from etid.estimators.output_error.prediction import (
     IMPULSE,
@@ -49,9 +42,10 @@ from etid.estimators.output_error.prediction import (
     scaled_residual,
     state_scale,
 )
-from etid.estimators.sandwich import Curvature
 from etid.estimators.score_tests.other_in_time import EXACT, Shown, bends, relaxed, score
 from etid.estimators.unknowns import Nuisance
+from etid.likelihood.sandwich import Curvature
+from etid.likelihood.source_prior import DELAY_WIDTH, SourcePrior, delay_std
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
 from etid.results.feed import CurrentSource, MeasuredCurrent, loaded
 from etid.results.fit import Support, rrse
@@ -89,7 +83,7 @@ def fit_source(
     ) -> Float[Array, " interval"]:
         return scaled_residual(record, unflatten(parameters), resistor(r).rational(), nuisance)
 
-    regularise = prior(start, records.sample_rate[0], r_load.mean())
+    regularise = SourcePrior.of(start, records.sample_rate[0], r_load.mean())
 
     q0, named = ravel_pytree((start_vector, jnp.zeros((count, start.order + 2))))
 

@@ -25,7 +25,7 @@ from etid.estimators.output_error.prediction import (
     measured_impulse,
     residual_variance,
 )
-from etid.estimators.sandwich import Curvature
+from etid.likelihood.sandwich import Curvature
 from etid.solvers.matrices import inverse
 
 

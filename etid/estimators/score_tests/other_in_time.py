@@ -48,9 +48,9 @@ from etid.estimators.output_error.prediction import (
     predict,
     residual_variance,
 )
-from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests.other_circuit import Fitted, Score, scores
 from etid.estimators.unknowns import Nuisance
+from etid.likelihood.sandwich import Linear
 from etid.results.driver import SourceImpedance
 from etid.results.feed import CurrentSource
 from etid.signals.filtering import CUTOFF, StateSpace, hold, simulate

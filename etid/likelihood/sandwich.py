@@ -11,9 +11,10 @@ heteroskedasticity-consistent covariance matrix estimator", Econometrica 48).
 import dataclasses
 
 import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from etid.precision import namespace
+from etid.signals.transfer import AnyArray
 from etid.solvers.matrices import inverse, inverse_root
 
 
@@ -25,10 +26,10 @@ class Curvature(eqx.Module):
         score: J C Jᵀ + P, the covariance of the gradient.
     """
 
-    expected: Float[Array, "n n"]
-    score: Float[Array, "n n"]
+    expected: Float[AnyArray, "n n"]
+    score: Float[AnyArray, "n n"]
 
-    def covariance(self) -> Float[Array, "n n"]:
+    def covariance(self) -> Float[AnyArray, "n n"]:
         """H⁻¹ (J C Jᵀ + P) H⁻¹."""
         bread = inverse(self.expected)
         return bread @ self.score @ bread
@@ -56,16 +57,16 @@ class Linear(eqx.Module):
         priors: Transposed Jacobian of the terms of the priors; None if they are among the others.
     """
 
-    jacobian: Float[Array, "q term"]
-    share: Float[Array, " term"]
-    noise: Float[Array, " term"]
-    priors: Float[Array, "q prior"] | None = None
+    jacobian: Float[AnyArray, "q term"]
+    share: Float[AnyArray, " term"]
+    noise: Float[AnyArray, " term"]
+    priors: Float[AnyArray, "q prior"] | None = None
 
     @property
-    def precision(self) -> Float[Array, "q q"]:
+    def precision(self) -> Float[AnyArray, "q q"]:
         """P."""
         if self.priors is None:
-            return jnp.zeros((len(self.jacobian), len(self.jacobian)))
+            return namespace(self.jacobian).zeros((len(self.jacobian), len(self.jacobian)))
         return self.priors @ self.priors.T
 
     def curvature(self) -> Curvature:
@@ -73,12 +74,12 @@ class Linear(eqx.Module):
         score = (self.jacobian * self.noise[None, :]) @ self.jacobian.T
         return Curvature(self._expected(), score + self.precision)
 
-    def bread(self) -> Float[Array, "q q"]:
+    def bread(self) -> Float[AnyArray, "q q"]:
         """H⁻¹, by Cholesky's factors: eigenvectors take five times as long."""
         root = inverse_root(self._expected())
         return root @ root.T
 
-    def covariance(self) -> Float[Array, "q q"]:
+    def covariance(self) -> Float[AnyArray, "q q"]:
         """The sandwich, from the effect of each term on the parameters: loses fewest digits."""
         bread = self.bread()
         by_term = bread @ self.jacobian
@@ -88,13 +89,13 @@ class Linear(eqx.Module):
         by_prior = bread @ self.priors
         return cov + by_prior @ by_prior.T
 
-    def told(self, rows: Float[Array, "row term"]) -> Float[Array, "row q"]:
+    def told(self, rows: Float[AnyArray, "row term"]) -> Float[AnyArray, "row q"]:
         """R W Jᵀ: products of other derivatives R of the terms with those of the parameters."""
         return (rows * self.share[None, :]) @ self.jacobian.T
 
     def projected(
-        self, rows: Float[Array, "row term"], covariance: Float[Array, "q q"] | None = None
-    ) -> tuple[Float[Array, "row term"], Float[Array, "row q"]]:
+        self, rows: Float[AnyArray, "row term"], covariance: Float[AnyArray, "q q"] | None = None
+    ) -> tuple[Float[AnyArray, "row term"], Float[AnyArray, "row q"]]:
         """Other derivatives R without what the parameters can do of them, and what these do then.
 
         `covariance` is the inverse of the information if other terms contribute to it.
@@ -107,10 +108,10 @@ class Linear(eqx.Module):
         priors = None if self.priors is None else self.priors[:count]
         return dataclasses.replace(self, jacobian=self.jacobian[:count], priors=priors)
 
-    def along(self, directions: Float[Array, "q z"]) -> "Linear":
+    def along(self, directions: Float[AnyArray, "q z"]) -> "Linear":
         """The terms with coordinates along these directions as parameters."""
         priors = None if self.priors is None else directions.T @ self.priors
         return dataclasses.replace(self, jacobian=directions.T @ self.jacobian, priors=priors)
 
-    def _expected(self) -> Float[Array, "q q"]:
+    def _expected(self) -> Float[AnyArray, "q q"]:
         return self.told(self.jacobian) + self.precision

@@ -1,7 +1,7 @@
 """Score tests of the calibrations of a driver: for a missing pole, and of the known resistors.
 
 Both project the effect of the common parameters out of further changes of the calibrations
-(`etid.estimators.sandwich`).
+(`etid.likelihood.sandwich`).
 
 **A missing pole.** A Z_th whose order is too low can fit a calibration with χ² = 1 and a residual
 of the size of the noise. It can still be wrong by 5 %. At 60 dB, order 3 in place of 5 or 6 changes
@@ -30,15 +30,13 @@ resistor, that of the capacitance is 1.0 to 3 times the other.
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+import numpy as np
+from jaxtyping import Bool, Complex, Float
 
-from etid.estimators.maximum_likelihood.calibrations import Calibrations
-from etid.estimators.maximum_likelihood.condensed import Near, means
-from etid.estimators.sandwich import Linear
-from etid.recordings.preflight import Inspected
-from etid.signals.transfer import as_complex, combined, frequency_variable, reciprocal
+from etid.likelihood.calibrations import Calibrations, Near
+from etid.likelihood.sandwich import Linear
+from etid.precision import array_function, namespace
+from etid.signals.transfer import AnyArray, combined, frequency_variable
 
 MISSING_POLE = (
     36.0  # χ² of two degrees of freedom; by chance one of about 100 sections has it once in 10⁶
@@ -56,50 +54,47 @@ BRIDGE = 0.25e-12
 # Part of the excess of chi2 that one wrong resistor must explain. Otherwise the records have
 # another fault, which can imitate a wrong resistor.
 EXPLAINED = 0.5
-# Factor by which rough values of |Z_th| may differ between resistors. At low frequency Z_th is real
-# to a few per cent.
-ROUGHLY = 3.0
 
 
+@array_function
 def sections(
-    frequency: Float[Array, " frequency"], highest: Float[Array, ""]
-) -> Complex[Array, "section 2 frequency"]:
+    frequency: Float[AnyArray, " frequency"], highest: Float[AnyArray, ""]
+) -> Complex[AnyArray, "section 2 frequency"]:
     """∂Z_th/∂g and ∂Z_th/∂h of all sections.
 
     Args:
         frequency: Frequencies [Hz].
         highest: End of the band, which begins with the first frequency [Hz].
     """
-    grid = jnp.geomspace(frequency[0] / BEYOND, highest * BEYOND, GRID)
-    omega, zeta = (of.ravel() for of in jnp.meshgrid(grid, jnp.asarray(DAMPINGS)))
-    x = frequency[None, :] / omega[:, None]
-    by_g = reciprocal(jax.lax.complex(1 - x * x, 2 * zeta[:, None] * x))
-    by_h = jax.lax.complex(-x * by_g.imag, x * by_g.real)
-    return jnp.stack([by_g, by_h], axis=1)
+    xp, lowest = namespace(frequency), frequency[0] / BEYOND
+    grid = lowest * (highest * BEYOND / lowest) ** np.linspace(0.0, 1.0, GRID)
+    x = xp.tile(frequency[None, :] / grid[:, None], (len(DAMPINGS), 1))
+    zeta = np.repeat(DAMPINGS, GRID)[:, None]
+    by_g = 1 / (1 - x * x + 2j * zeta * x)
+    return xp.stack([by_g, 1j * x * by_g], axis=1)
 
 
+@array_function
 def missing_pole(
     calibrations: Calibrations, near: Near, linear: Linear
-) -> Float[Array, " section"]:
+) -> Float[AnyArray, " section"]:
     """Score statistic of each section: χ² with two degrees of freedom if the section is absent.
 
     It is NaN if a section has no effect. `near` and `linear` are those of the minimum.
     """
-    spectra = calibrations.spectra
+    spectra, xp = calibrations.spectra, namespace(near.q)
     # The harmonics of the records differ so little that the sections are equal.
     frequency = calibrations.knots.at(spectra.frequency[0])
-    highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, frequency[0]))
-    by_z = sections(frequency, highest).reshape(-1, 1, frequency.size)
-    directions, others = linear.projected(near.condensed.rows(by_z * near.slopes.by_z[None]))
+    highest = xp.where(spectra.selected, spectra.frequency, frequency[0]).max()
+    by_z = sections(frequency, highest).reshape(-1, 1, frequency.shape[0])
+    directions, others = linear.projected(near.condensed.rows(by_z * near.slopes.by_z))
     score = directions @ near.condensed.part - others @ calibrations.rest(near.q)
     s, t = score.reshape(-1, 2).T  # of g and of h
-    by_g, by_h = jnp.moveaxis(directions.reshape(s.size, 2, -1), 1, 0)
+    by_g, by_h = xp.moveaxis(directions.reshape(s.shape[0], 2, -1), 1, 0)
     aa, ab, bb = (of @ linear.noise for of in (by_g * by_g, by_g * by_h, by_h * by_h))
-    of_priors = (others @ linear.precision).reshape(s.size, 2, -1)
-    (more_aa, more_ab), (_, more_bb) = jnp.einsum(
-        "sic,sjc->ijs", of_priors, others.reshape(s.size, 2, -1)
-    )
-    aa, ab, bb = aa + more_aa, ab + more_ab, bb + more_bb
+    of_priors = (others @ linear.precision).reshape(s.shape[0], 2, -1)
+    more = of_priors @ others.reshape(s.shape[0], 2, -1).swapaxes(-1, -2)
+    aa, ab, bb = aa + more[:, 0, 0], ab + more[:, 0, 1], bb + more[:, 1, 1]
     return (s * s * bb - 2 * s * t * ab + t * t * aa) / (aa * bb - ab * ab)
 
 
@@ -111,66 +106,64 @@ class Mismatch(NamedTuple):
         across: Capacitance across the resistor [F], and its standard error.
     """
 
-    off: Float[Array, "2 record"]
-    across: Float[Array, "2 record"]
+    off: Float[AnyArray, "2 record"]
+    across: Float[AnyArray, "2 record"]
 
 
+@array_function
 def mismatch(calibrations: Calibrations, near: Near, linear: Linear) -> Mismatch:
     """What is wrong with each known resistor; `near` and `linear` are those of the minimum.
 
     Stated tolerances are in the errors, because `linear` has the errors of the instrument.
     """
-    slopes, every = near.slopes, calibrations.knots
-    alone = as_complex(jnp.eye(slopes.gains.shape[0]))[:, :, None]
-    by_resistor = alone * (-slopes.z * slopes.by_z)[None]
+    slopes, every, xp = near.slopes, calibrations.knots, namespace(near.q)
+    records = slopes.gains.shape[0]
+    alone = np.eye(records)[:, :, None]
+    by_resistor = alone * (-slopes.z * slopes.by_z)
     # ∂ log Z / ∂C of Z = R ‖ C at C = 0 is −s R.
     s = frequency_variable(every.at(calibrations.spectra.frequency))
-    across = -s * as_complex(calibrations.calibration.r_load)[:, None]
-    changes = jnp.concatenate([by_resistor, across[None] * by_resistor])
+    across = -s * calibrations.calibration.r_load[:, None]
+    changes = xp.concatenate([by_resistor, across * by_resistor])
     rows = near.condensed.rows(changes)
     directions, others = linear.projected(rows)
-    own = jnp.sum(rows * linear.share[None, :] * directions, axis=1)
+    own = (rows * linear.share * directions).sum(1)
     score = directions @ near.condensed.part - others @ calibrations.rest(near.q)
     # Estimate the noise after the change that explains most: its error must not count as noise.
-    best = jnp.argmax(score**2 / own)
-    made = combined(others[best], slopes.by_unknown.reshape(linear.jacobian.shape[0], -1))
-    change = (made.reshape(slopes.gains.shape) - changes[best]) * as_complex(score / own)[best]
-    part = calibrations.terms(near.profiles[0].gains + every.between(change))
-    noise = means(near.profiles, every, calibrations.noise(part)[None])
-    of_priors = jnp.sum((others @ linear.precision) * others, axis=1)
-    error = jnp.sqrt(jnp.sum(noise * directions**2, axis=1) + of_priors) / own
-    found = jnp.stack([score / own, error]).reshape(2, 2, -1)
+    best = xp.argmax(score**2 / own)
+    made = combined(others[best], slopes.by_q.reshape(linear.jacobian.shape[0], -1))
+    change = (made.reshape(slopes.gains.shape) - changes[best]) * (score / own)[best]
+    at = calibrations.profiles(near.profiles[0].gains + every.between(change))
+    noise = near.condensed.means(near.profiles, every, calibrations.noise(at)[None])[0]
+    of_priors = ((others @ linear.precision) * others).sum(1)
+    error = xp.sqrt((noise * directions**2).sum(1) + of_priors) / own
+    found = xp.stack([score / own, error]).reshape(2, 2, -1)
     # Of a capacitance the value that was entered is 0: the others show its excess, up to the sign.
-    return Mismatch(found[:, 0], jnp.array([[-1.0], [1.0]]) * found[:, 1])
+    return Mismatch(found[:, 0], np.array([[-1.0], [1.0]]) * found[:, 1])
 
 
+@array_function
 def disagree(
-    mismatch: Float[Array, "2 record"],
-    chi2: Float[Array, ""],
-    terms: Float[Array, ""],
+    mismatch: Float[AnyArray, "2 record"],
+    chi2: Float[AnyArray, ""],
+    terms: Float[AnyArray, ""],
     smallest: float = SMALLEST,
-) -> Bool[Array, ""]:
+) -> Bool[AnyArray, ""]:
     """Whether a known resistor is seen to be wrong by more than `smallest`."""
     off, error = mismatch
     squares = (off / error) ** 2
     # The errors use the noise without the wrong resistor; χ² uses the noise of the records.
-    left = jnp.maximum(chi2 / (1 + squares / terms), 1.0)
+    xp = namespace(off)
+    left = xp.maximum(chi2 / (1 + squares / terms), 1.0)
     explained = squares * left > EXPLAINED * (chi2 - 1) * terms
-    return jnp.any((squares > RESISTOR**2) & (jnp.abs(off) > smallest) & explained)
+    return ((squares > RESISTOR**2) & (xp.abs(off) > smallest) & explained).any()
 
 
 def bridged(
-    across: Float[Array, "2 record"],
-    chi2: Float[Array, ""],
-    terms: Float[Array, ""],
-    missing_pole: Float[Array, ""],
-) -> Bool[Array, ""]:
+    across: Float[AnyArray, "2 record"],
+    chi2: Float[AnyArray, ""],
+    terms: Float[AnyArray, ""],
+    missing_pole: Float[AnyArray, ""],
+) -> Bool[AnyArray, ""]:
     """Whether a capacitance across a known resistor is seen, and no likelier missing pole."""
-    likelier = jnp.max((across[0] / across[1]) ** 2) > missing_pole
+    likelier = ((across[0] / across[1]) ** 2).max() > missing_pole
     return likelier & disagree(across, chi2, terms, BRIDGE)
-
-
-def rough_impedance(calibration: Inspected, r_load: float) -> float:
-    """Rough |Z_th| [Ω] from a resistor [Ω] and the amplitudes of both records."""
-    x, y = (v - v.mean() for v in calibration.aligned)
-    return r_load * abs(float(x @ x / (y @ x)) - 1)

@@ -1,0 +1,317 @@
+"""The likelihood of the calibrations of a driver.
+
+It is that of `etid.likelihood.profile`. Calibrations that share an unloaded record are outputs of
+one input, so that all of them tell of the same X; the others have inputs of their own. The
+objective is that of all harmonics; gradient, curvature, covariance and score tests are condensed.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Complex, Float
+
+from etid.likelihood.gains import FAULTS, Slopes
+from etid.likelihood.noise import excess
+from etid.likelihood.profile import Condensed, Profile, Records, added
+from etid.likelihood.sandwich import Linear
+from etid.likelihood.source_prior import DELAY_WIDTH, SourcePrior, delay_width
+from etid.precision import array_function, namespace
+from etid.results.driver import Calibration, HarmonicDriver
+from etid.results.feed import SourceImpedance
+from etid.results.instrument import Instrument
+from etid.signals import modal
+from etid.signals.harmonics import Spectrum, same_unloaded, signal_share
+from etid.signals.knots import Knots, knots
+from etid.signals.transfer import (
+    AnyArray,
+    as_complex,
+    delayed,
+    frequency_variable,
+    power,
+    reciprocal,
+)
+from etid.solvers.matrices import inverse_root
+
+DENSE = 32  # density of the knots: the floor of the driver's valley is flat
+
+
+class Near(NamedTuple):
+    """The calibrations near a point.
+
+    Attributes:
+        q: The point.
+        profiles: The likelihood of each unloaded record and its outputs at all harmonics.
+        condensed: The same of all of them at the knots.
+        slopes: The gains and their derivatives at the knots; their z is Z_th.
+    """
+
+    q: Float[AnyArray, "*row q"]
+    profiles: list[Profile]
+    condensed: Condensed
+    slopes: Slopes
+
+    @property
+    def objective(self) -> Float[AnyArray, "*row"]:
+        """½ Σ r² of the records, at all harmonics."""
+        return added([of.objective for of in self.profiles])
+
+    @property
+    def jacobian(self) -> Float[AnyArray, "*row q part"]:
+        """Transposed Jacobian of the condensed terms."""
+        return self.condensed.rows(self.slopes.by_q)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Calibrations:
+    """The likelihood of the calibrations of a driver.
+
+    In all methods `common` is the vector of the parameters of Z_th and of the delays of the
+    calibrations [samples], followed by the errors of the instrument in their standard deviations:
+    gain, crosstalk, capacitance, then the known resistor of each calibration and the capacitance
+    across it, which those of equal value share. A gain g, a crosstalk κ, an error θ of the resistor
+    R and a capacitance C across it change the gains to
+
+        V_out / V_th = (1 + g) R' / (R' + Z_th) + κ,      R' = R (1 + θ) ‖ C.
+
+    Attributes:
+        source: Z_th identified from the calibrations.
+        calibration: Resistors and delays of the calibrations.
+        spectra: Harmonics of the calibrations.
+        rate: Sampling rate of the calibrations [Hz].
+        delay_width: Prior standard deviation of every trigger delay, of loads too [samples].
+        instrument: Tolerances of the instrument; None if it has none.
+    """
+
+    source: SourceImpedance
+    calibration: Calibration
+    spectra: Spectrum
+    rate: AnyArray
+    delay_width: AnyArray = DELAY_WIDTH
+    instrument: Instrument | None = None
+
+    @classmethod
+    def of(cls, driver: HarmonicDriver) -> "Calibrations":
+        """The calibrations of an identified driver."""
+        rate = namespace(driver.sample_rate).asarray(driver.sample_rate)
+        width = delay_width(driver.instrument, rate)
+        of = driver.source, driver.calibration, driver.spectra, rate, width
+        return cls(*of, instrument=driver.instrument)
+
+    @property
+    def tolerances(self) -> Float[AnyArray, " error"]:
+        """Standard deviation of each error of the instrument."""
+        of, count = self.instrument, self.calibration.r_load.shape[0]
+        return np.zeros(0) if of is None else of.deviations(count)
+
+    @functools.cached_property
+    def unknowns(self) -> int:
+        """Number of parameters of Z_th and of delays, which the errors of the instrument follow."""
+        return self._of_source + self.calibration.r_load.shape[0]
+
+    @functools.cached_property
+    def _of_source(self) -> int:
+        return 1 + modal.SECTION * self._sections + 2 * self.source.log_omega_real.shape[0]
+
+    @functools.cached_property
+    def _sections(self) -> int:
+        return self.source.log_omega.shape[0]
+
+    @property
+    def terms(self) -> float:
+        """Number of real terms of the records."""
+        return 2.0 * self.spectra.selected.sum()
+
+    def parameters(self, common: Float[AnyArray, "*row common"]) -> AnyArray:
+        """The parameters of Z_th among the common parameters (*row parameter)."""
+        return common[..., : self._of_source]
+
+    def delays(self, common: Float[AnyArray, "*row common"]) -> AnyArray:
+        """The trigger delays of the calibrations [samples] (*row record)."""
+        return common[..., self._of_source : self.unknowns]
+
+    def errors(self, common: Float[AnyArray, "*row common"]) -> AnyArray:
+        """The errors of the instrument among the common parameters (*row error)."""
+        return common[..., self.unknowns :]
+
+    def source_of(self, common: Float[AnyArray, " common"]) -> SourceImpedance:
+        """Z_th with these common parameters."""
+        return self.source.of_vector(self.parameters(common))
+
+    @property
+    def prior(self) -> SourcePrior:
+        """The weak prior of Z_th."""
+        return SourcePrior.of(self.source, self.rate, self.calibration.r_load.mean())
+
+    @property
+    def knots(self) -> Knots:
+        """Knots of the harmonics."""
+        return knots(self.spectra.x.shape[-1], DENSE)
+
+    def records(self) -> list[Records]:
+        """Each unloaded record with the outputs of all calibrations.
+
+        An output is used with the first input that is its own unloaded record.
+        """
+        s = self.spectra
+        xp, found = namespace(s.x), []
+        free = np.ones(s.x.shape[0], bool)
+        for number in range(s.x.shape[0]):
+            x = s.x[number]
+            mine = xp.stack([xp.asarray(same_unloaded(x, other)) for other in s.x]) & free
+            free = free & ~mine
+            if xp is np and not mine.any():
+                continue
+            of_x = s.frequency[number], x, s.variance_x[number]
+            found.append(Records(*of_x, s.y, s.variance_y, s.selected & mine[:, None]))
+        return found
+
+    @array_function
+    def profiles(self, gains: Complex[AnyArray, "*row record bin"]) -> list[Profile]:
+        """The likelihood of each unloaded record and its outputs."""
+        return [Profile.of(of, gains) for of in self.records()]
+
+    @array_function
+    def squares(self, profiles: list[Profile]) -> Float[AnyArray, "*row record bin"]:
+        """|innovation|² of each calibration over its variance; 0 where a harmonic is not used."""
+        xp = namespace(profiles[0].x)
+        return added([xp.where(of.weight > 0, of.squares, 0.0) for of in profiles])
+
+    def start(self) -> Float[AnyArray, " common"]:
+        """The common parameters identified from the calibrations alone."""
+        errors = self.calibration.errors
+        if self.instrument is None or errors is None:
+            errors = namespace(self.tolerances).zeros_like(self.tolerances)
+        parts = self.source.vector(), self.calibration.delay_samples, errors
+        return namespace(*parts).concatenate(parts)
+
+    @array_function
+    def gains(
+        self, common: Float[AnyArray, "*row common"], every: Knots | None = None
+    ) -> Complex[AnyArray, "*row record bin"]:
+        """Gains R e^(−jωτ) / (R + Z_th) with the known resistors, at all harmonics or at knots."""
+        f = self._frequency(every)
+        z_th = modal.impedance(self.parameters(common)[..., None, :], self._sections, f)
+        return self._gains(common, f, z_th)[0]
+
+    def _frequency(self, every: Knots | None) -> Float[AnyArray, "record bin"]:
+        of = self.spectra.frequency
+        return of if every is None else every.at(of)
+
+    def _gains(
+        self,
+        common: Float[AnyArray, "*row common"],
+        f: Float[AnyArray, "record bin"],
+        z_th: Complex[AnyArray, "*row record bin"],
+    ) -> tuple[AnyArray, AnyArray, AnyArray | None]:
+        """The gains, and their derivatives with respect to Z_th and to the errors."""
+        xp, r_load = namespace(common, z_th), self.calibration.r_load
+        known = resistance = as_complex(r_load)[:, None]
+        # Records with equal values are of one resistor: they have the errors of the first of them.
+        first = (r_load[:, None] == r_load[None]).argmax(1)
+        off, s = as_complex(self.tolerances * self.errors(common)), frequency_variable(f)
+        right = known  # R (1 + θ)
+        if self.instrument is not None:
+            of_each = off[..., FAULTS:].reshape(*off.shape[:-1], 2, -1)[..., first, None]
+            right = known * (1 + of_each[..., 0, :, :])
+            resistance = right * reciprocal(1 + s * of_each[..., 1, :, :] * right)
+        loop = reciprocal(resistance + z_th)
+        gains = delayed(resistance * loop, f, self.delays(common), self.rate)
+        by_z = -gains * loop
+        if self.instrument is None:
+            return gains, by_z, None
+        gain, crosstalk = off[..., 0, None, None], off[..., 1, None, None]
+        turned = gains * (resistance + z_th) * reciprocal(resistance)
+        of_loads = xp.stack([gains, turned, xp.zeros_like(gains)], -3)  # nothing is across a skin
+        # ∂R'/∂θ = R R'² / (R (1 + θ))²,      ∂R'/∂C = −s R'²
+        by_r = -(1 + gain) * by_z * z_th * resistance
+        each = xp.stack([by_r * known * reciprocal(right * right), -s * by_r], -3)
+        alone = xp.eye(known.shape[0])[first].T[:, :, None]
+        each = (alone * each[..., None, :, :]).reshape(*by_z.shape[:-2], -1, *by_z.shape[-2:])
+        by_error = xp.concatenate([of_loads, each], -3)
+        by_error = by_error * self.tolerances[:, None, None]
+        return (1 + gain) * gains + crosstalk * turned, (1 + gain) * by_z, by_error
+
+    @array_function
+    def slopes(self, common: Float[AnyArray, "*row common"], every: Knots | None = None) -> Slopes:
+        """The gains and their derivatives, at all harmonics or at knots."""
+        f, xp = self._frequency(every), namespace(common, self.spectra.x)
+        of = self.parameters(common)[..., None, :], self._sections, f
+        z_th, by_source = modal.with_slopes(*of)
+        gains, by_z, by_error = self._gains(common, f, z_th)
+        by_source = xp.moveaxis(by_source, -2, -3) * by_z[..., None, :, :]
+        by_delay = (-gains * frequency_variable(f / self.rate))[..., None, :, :]
+        rows = [by_source, np.eye(f.shape[0])[:, :, None] * by_delay]
+        rows += [] if by_error is None else [by_error]
+        return Slopes(z_th, gains, by_z, xp.concatenate(rows, -3))
+
+    @array_function
+    def near(self, common: Float[AnyArray, "*row common"]) -> Near:
+        """The calibrations near these common parameters."""
+        every, profiles = self.knots, self.profiles(self.gains(common))
+        return Near(common, profiles, Condensed.of(profiles, every), self.slopes(common, every))
+
+    @array_function
+    def linear(self, near: Near) -> Linear:
+        """The condensed terms, linear in the common parameters, at one point."""
+        xp, shares = namespace(near.q), []
+        for records, of in zip(self.records(), near.profiles, strict=True):
+            told = xp.where(records.used, power(of.gains) / records.variance_y, 0.0)
+            variance = 1 / (1 / records.variance_x + told.sum(0))  # of X̂
+            shares.append(xp.where(of.weight > 0, signal_share(of.x, variance), 0.0))
+        values = xp.stack([added(shares), self.noise(near.profiles)])
+        means = near.condensed.means(near.profiles, self.knots, values)
+        return Linear(near.jacobian, means[0], means[1], priors=self.weak(near.q)[1])
+
+    @array_function
+    def noise(self, profiles: list[Profile]) -> Float[AnyArray, "*row record bin"]:
+        """`excess` of the innovations of each calibration."""
+        return excess(self.squares(profiles), self.spectra.selected)
+
+    def following(self, linear: Linear) -> Float[AnyArray, "known error"]:
+        """Changes of Z_th and of the delays at their minimum by the errors of the instrument."""
+        curvature, known = linear.curvature().expected, self.unknowns
+        root = inverse_root(curvature[:known, :known])
+        return -root @ (root.T @ curvature[:known, known:])
+
+    def gradient(self, near: Near, linear: Linear) -> Float[AnyArray, " common"]:
+        """Gradient of the condensed terms and of the weak priors."""
+        return linear.jacobian @ near.condensed.part + self.rest(near.q)
+
+    def rest(self, common: Float[AnyArray, " common"]) -> Float[AnyArray, " common"]:
+        """Gradient of the weak priors."""
+        terms, rows = self.weak(common)
+        return rows @ terms
+
+    @array_function
+    def weak(
+        self, common: Float[AnyArray, "*row common"]
+    ) -> tuple[Float[AnyArray, "*row term"], Float[AnyArray, "*row common term"]]:
+        """The terms of the weak priors and their derivatives."""
+        xp, kept, size = namespace(common), self._of_source, common.shape[-1]
+        terms, by_source = self.prior.with_slopes(self.parameters(common))
+        none = xp.zeros((*common.shape[:-1], size - kept, terms.shape[-1]))
+        others = np.ones(size - kept)
+        others = xp.concatenate(
+            [others[: self.unknowns - kept] / self.delay_width, others[self.unknowns - kept :]]
+        )
+        rows = np.eye(size)[:, kept:] * others + xp.zeros((*common.shape, 1))
+        terms = xp.concatenate([terms, common[..., kept:] * others], -1)
+        return terms, xp.concatenate([xp.concatenate([by_source, none], -2), rows], -1)
+
+    @array_function
+    def strain(self, common: Float[AnyArray, " common"]) -> Float[AnyArray, ""]:
+        """Increase of the Σ r² of the calibrations over its value at their own minimum.
+
+        r is in standard deviations of the noise of the calibrations. If loads and calibrations
+        agree, the increase is about the number of common parameters.
+        """
+        start, at = self.start(), []
+        for c in (common, start):
+            profiles = self.profiles(self.gains(c))
+            at.append((2 * self.squares(profiles), self.weak(c)[0] ** 2, self.noise(profiles)))
+        (squares, weak, _), (before, weak_before, noise) = at
+        return ((squares - before) / noise).sum() + (weak - weak_before).sum()
