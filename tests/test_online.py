@@ -193,7 +193,9 @@ def test_what_is_known_of_skin_fades_as_a_random_walk_says():
 def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
     tracker, _, clean = ten()
     driver, _ = calibrated()
-    known = known_at(tracker.model.bands.frequency, driver, False, MAXIMUM_LIKELIHOOD)
+    known = jax.device_put(
+        known_at(tracker.model.bands.frequency, driver, False, MAXIMUM_LIKELIHOOD)
+    )
     pulses = clean[:6]
     state = followed(tracker, with_noise(pulses, seed=4))
     state = dataclasses.replace(state, noise=tracker.start().noise)  # of the same weights

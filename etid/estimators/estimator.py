@@ -166,7 +166,9 @@ class AbstractEstimator(abc.ABC):
     def describe(self) -> Description:
         """The text for a methods section, including the options."""
 
-    def known(self, driver: Any, frequency: Float[Array, " harmonic"], shared: bool) -> Any:
+    def known(
+        self, driver: Any, frequency: Float[Array | np.ndarray, " harmonic"], shared: bool
+    ) -> Any:
         """Data that all loads of a driver with the same harmonics share; computed once.
 
         Args:

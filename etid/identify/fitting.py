@@ -37,7 +37,9 @@ from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.identify import changes
 from etid.identify.second_minimum import ASIDE, likelier
+from etid.numpy_tier.algebra import one_thread
 from etid.numpy_tier.tiers import program, worth_compiling
+from etid.precision import untraced
 from etid.recordings.causes import LOG, log_changes
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
@@ -48,6 +50,7 @@ from etid.results.fit import Fit, Support
 from etid.results.verdicts import message, verdicts_of
 from etid.selection.evidence import best
 from etid.selection.search import search
+from etid.signals.transfer import AnyArray
 
 FEWEST = 16  # recordings that are read and fitted at once, however long they are
 HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least `FEWEST`
@@ -108,15 +111,15 @@ def filled(lanes: Sequence[AbstractLane]) -> AbstractLane:
     return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
 
 
-@program  # once for each driver
+@one_thread()
 def known_at(
-    frequency: Float[Array, " harmonic"],
+    frequency: Float[AnyArray, " harmonic"],
     driver: AbstractFeed,
     shared: bool,
     estimator: AbstractEstimator,
 ) -> Any:
-    """`AbstractEstimator.known`, compiled."""
-    return estimator.known(driver, frequency, shared)
+    """`AbstractEstimator.known` with arrays of NumPy."""
+    return estimator.known(untraced(driver), np.asarray(frequency), shared)
 
 
 def known_of(
@@ -147,7 +150,7 @@ class _Same:
 
 @functools.lru_cache(maxsize=4)
 def _known_of(driver: _Same, frequency: bytes, shared: bool, estimator: AbstractEstimator) -> Any:
-    return known_at(jax.device_put(np.frombuffer(frequency)), driver.driver, shared, estimator)
+    return known_at(np.frombuffer(frequency), driver.driver, shared, estimator)
 
 
 def checksum(seen: Inspected) -> int:

@@ -179,7 +179,7 @@ class Tracker(Overviewed, Kept):
             raise IdentificationError(
                 f"unloaded recording {unloaded.path!r}: {error}", None
             ) from None
-        known = known_at(bands.frequency, driver, False, MAXIMUM_LIKELIHOOD)
+        known = jax.device_put(known_at(bands.frequency, driver, False, MAXIMUM_LIKELIHOOD))
         low, high = unloaded.adc_range or (-np.inf, np.inf)
         half = seen.step[0] / 2
         model = GainModel.of(

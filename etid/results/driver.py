@@ -11,14 +11,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.display import per_cent, plus_minus, quality, rounded, several
 from etid.circuits.impedance import Quantity
 from etid.circuits.overview import Overview, Overviewed
 from etid.numpy_tier.tiers import in_numpy
-from etid.precision import Module
+from etid.precision import Module, namespace
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import texts
 from etid.recordings.study import Study
@@ -303,17 +302,17 @@ class ContinuousDriver(Driver):
         drift = None if self.instrument is None else self.instrument.drift
         return np.asarray(drift) if isinstance(drift, int | float) else drift
 
-    def drift_std(self, drift: float | None = None) -> Float[Array, " parameter"]:
+    def drift_std(self, drift: float | None = None) -> Float[AnyArray, " parameter"]:
         """Standard deviations of the parameters of `source` that come from a drift alone.
 
         It is that of the driver if it is not given.
         """
         # Frequencies, dampings and R are stored as logarithms, so their changes are relative.
-        relative = jax.tree.map(jnp.ones_like, self.source)
-        gains = (self.source.gain, self.source.slope, self.source.gain_real)
-        relative = eqx.tree_at(lambda s: (s.gain, s.slope, s.gain_real), relative, gains)
+        vector = self.source.vector()
+        relative = np.isin(np.arange(vector.shape[0]), self.source.gains)
         own = 0.0 if self.drift is None else self.drift
-        return jnp.abs(ravel_pytree(relative)[0]) * (own if drift is None else drift)
+        xp = namespace(vector)
+        return xp.where(relative, xp.abs(vector), 1.0) * (own if drift is None else drift)
 
     def later_cov(self) -> Float[Array, "parameter parameter"]:
         """Covariance of the parameters of `source` at the time when a skin is recorded."""

@@ -117,6 +117,13 @@ class SourceImpedance(Module):
         pairs, reals = self.log_omega.shape[0], self.log_omega_real.shape[0]
         return np.r_[1 : 1 + pairs, 1 + 4 * pairs : 1 + 4 * pairs + reals]
 
+    @property
+    def gains(self) -> Int[np.ndarray, " gain"]:
+        """Places of all impedances among the parameters; the others are logarithms."""
+        pairs, reals = self.log_omega.shape[0], self.log_omega_real.shape[0]
+        ends = 1 + modal.SECTION * pairs + reals
+        return np.r_[1 + 2 * pairs : 1 + modal.SECTION * pairs, ends : ends + reals]
+
     def state_space(self) -> StateSpace:
         """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""
         order = self.order

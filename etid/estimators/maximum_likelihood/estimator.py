@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits, stated_limits
@@ -121,7 +121,7 @@ class MaximumLikelihood(AbstractEstimator):
     def known(
         self,
         driver: HarmonicDriver | MeasuredCurrent,
-        frequency: Float[Array, " harmonic"],
+        frequency: Float[AnyArray, " harmonic"],
         shared: bool,
     ) -> GivenDriver:
         """The distribution of Z_th at the harmonics, given the calibrations; or the current."""

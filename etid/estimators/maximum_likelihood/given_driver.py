@@ -52,12 +52,12 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.source_prior import DELAY_WIDTH
-from etid.precision import Module
+from etid.precision import Module, array_function, namespace
 from etid.results.driver import HarmonicDriver
 from etid.results.instrument import BUDGETED, Instrument
 from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots
-from etid.signals.transfer import as_complex, combined, frequency_variable, reciprocal
+from etid.signals.transfer import AnyArray, as_complex, combined, frequency_variable, reciprocal
 from etid.solvers.matrices import inverse_root
 
 
@@ -71,10 +71,10 @@ class UnloadedEstimate(NamedTuple):
         log_variance_by_z: Derivatives of the logarithm of the variance.
     """
 
-    x: Complex[Array, " harmonic"]
-    variance: Float[Array, " harmonic"]
-    x_by_z: Complex[Array, "z harmonic"]
-    log_variance_by_z: Float[Array, "z harmonic"]
+    x: Complex[AnyArray, " harmonic"]
+    variance: Float[AnyArray, " harmonic"]
+    x_by_z: Complex[AnyArray, "z harmonic"]
+    log_variance_by_z: Float[AnyArray, "z harmonic"]
 
 
 class InstrumentErrors(Module):
@@ -91,11 +91,11 @@ class InstrumentErrors(Module):
         told: The instrument; None without one.
     """
 
-    at: Float[Array, " error"]
-    by_z: Float[Array, "z error"]
-    unstated: Float[Array, "z error"]
-    direct: Float[Array, "3"]
-    drift: Float[Array, "z parameter"]
+    at: Float[AnyArray, " error"]
+    by_z: Float[AnyArray, "z error"]
+    unstated: Float[AnyArray, "z error"]
+    direct: Float[AnyArray, "3"]
+    drift: Float[AnyArray, "z parameter"]
     told: Instrument | None
 
     def values(self, z: Float[Array, " z"]) -> Float[Array, " error"]:
@@ -129,36 +129,36 @@ class GivenDriver(Module):
         by_current: Whether the input is a measured current: the gain is Z_L, and there is no z.
     """
 
-    frequency: Float[Array, " harmonic"]
-    loaded: Complex[Array, " harmonic"]
-    w_slope: Complex[Array, " harmonic"]
-    slope: Complex[Array, "z harmonic"]
-    resistance: Float[Array, ""]
-    mean: Float[Array, " z"]
-    cov: Float[Array, "z z"]
+    frequency: Float[AnyArray, " harmonic"]
+    loaded: Complex[AnyArray, " harmonic"]
+    w_slope: Complex[AnyArray, " harmonic"]
+    slope: Complex[AnyArray, "z harmonic"]
+    resistance: Float[AnyArray, ""]
+    mean: Float[AnyArray, " z"]
+    cov: Float[AnyArray, "z z"]
     records: Spectrum | None
-    gains: Complex[Array, "calibration known"] | None
-    gain_slopes: Complex[Array, "z calibration known"] | None
+    gains: Complex[AnyArray, "calibration known"] | None
+    gain_slopes: Complex[AnyArray, "z calibration known"] | None
     shape: UnloadedShape | None = None
-    delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
-    faults: tuple[Float[Array, "3"], Float[Array, "z 3"]] | None = None
+    delay_width: Float[AnyArray, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
+    faults: tuple[Float[AnyArray, "3"], Float[AnyArray, "z 3"]] | None = None
     errors: InstrumentErrors | None = None
-    bend: Complex[Array, " harmonic"] | None = None
-    aside: Float[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    bend: Complex[AnyArray, " harmonic"] | None = None
+    aside: Float[AnyArray, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     by_current: bool = eqx.field(static=True, default=False)
 
     @classmethod
-    def measured(cls, frequency: Float[Array, " harmonic"]) -> "GivenDriver":
+    def measured(cls, frequency: Float[AnyArray, " harmonic"]) -> "GivenDriver":
         """The measured current of loads with these harmonics [Hz]."""
-        nothing, none = jnp.zeros_like(frequency, dtype=complex), jnp.zeros(0)
+        nothing, none = np.zeros(frequency.shape, complex), np.zeros(0)
         return cls(
             frequency=frequency,
             loaded=nothing,
             w_slope=nothing,
             slope=nothing[None][:0],
-            resistance=jnp.zeros(()),
+            resistance=np.zeros(()),
             mean=none,
-            cov=jnp.diag(none),
+            cov=np.diag(none),
             records=None,
             gains=None,
             gain_slopes=None,
@@ -166,8 +166,8 @@ class GivenDriver(Module):
         )
 
     def w(
-        self, z: Float[Array, " z"]
-    ) -> tuple[Complex[Array, " harmonic"], Complex[Array, "z harmonic"]]:
+        self, z: Float[AnyArray, " z"]
+    ) -> tuple[Complex[AnyArray, " harmonic"], Complex[AnyArray, "z harmonic"]]:
         """W − W₀ by z, and its derivatives."""
         w, slope = combined(z, self.slope), self.slope
         if self.bend is None or self.errors is None:
@@ -176,21 +176,21 @@ class GivenDriver(Module):
         w = w + as_complex(0.5 * theta**2) * self.bend
         return w, slope + as_complex(theta * by_z)[:, None] * self.bend[None]
 
-    def z_th(self, w: Complex[Array, " harmonic"]) -> Complex[Array, " harmonic"]:
+    def z_th(self, w: Complex[AnyArray, " harmonic"]) -> Complex[AnyArray, " harmonic"]:
         """Z_th [Ω] at W₀ + w."""
         # (2, 2) Padé approximant of the exponential: error w⁵/720, a tenth of the time.
-        square = 1 + w * w * as_complex(jnp.array(1 / 12))
-        half = w * as_complex(jnp.array(0.5))
+        square = 1 + w * w / 12
+        half = 0.5 * w
         return self.loaded * (square + half) * reciprocal(square - half) - as_complex(
             self.resistance
         )
 
     def current(
-        self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
+        self, total: Complex[AnyArray, " harmonic"], w: Complex[AnyArray, " harmonic"]
+    ) -> Complex[AnyArray, " harmonic"]:
         """Current per input through this impedance [Ω] at W₀ + w."""
         if self.by_current:
-            return jnp.ones_like(total)
+            return namespace(total).ones_like(total)
         return reciprocal(total + self.z_th(w))
 
     def starts(
@@ -248,47 +248,50 @@ class GivenDriver(Module):
         return UnloadedEstimate(profile.x, profile.variance_x, *jax.vmap(slope)(slopes))
 
 
+@array_function
 def given(
-    driver: HarmonicDriver, frequency: Float[Array, " harmonic"], shared: bool
+    driver: HarmonicDriver, frequency: Float[AnyArray, " harmonic"], shared: bool
 ) -> GivenDriver:
     """The distribution of Z_th given the calibrations, at the harmonics of the loads [Hz].
 
     `shared` says whether the unloaded record of a load may be that of a calibration.
     """
+    xp = namespace(frequency, driver.source.gain)
     calibrations, told = Calibrations.of(driver), driver.instrument
     c, unknowns = calibrations.start(), calibrations.unknowns
     # Those that nobody stated have a size, too, so that their effects are known.
     every = dataclasses.replace(calibrations, instrument=(told or Instrument()).complete())
     sizes = every.tolerances
-    at = jnp.concatenate([c[:unknowns], jnp.zeros_like(sizes) if told is None else c[unknowns:]])
+    at = xp.concatenate([c[:unknowns], xp.zeros_like(sizes) if told is None else c[unknowns:]])
     near = every.near(at)
     linear = every.linear(near)
-    stated = jnp.zeros_like(sizes)
+    stated = xp.zeros_like(sizes)
     if told is not None:
-        stated = jnp.where(calibrations.tolerances > 0, 1.0, 0.0)
-    free = jnp.concatenate([jnp.ones(unknowns), stated])[: c.size]
+        stated = xp.where(calibrations.tolerances > 0, 1.0, 0.0)
+    free = xp.concatenate([xp.ones(unknowns), stated])[: c.size]
     curvature = linear.curvature().expected
-    fixed = jnp.diag(1 - free)
+    fixed = xp.diag(1 - free)
     own = curvature[: c.size, : c.size] * free[:, None] * free[None] + fixed
     directions = free[:, None] * inverse_root(own)
     mean = -directions.T @ every.gradient(near, linear)[: c.size]
-    along = jnp.pad(directions, ((0, at.size - c.size), (0, 0)))
+    along = xp.pad(directions, ((0, at.size - c.size), (0, 0)))
     cov = linear.along(along).curvature().score + fixed
     unstated = -directions.T @ curvature[: c.size, unknowns:] * (1 - stated)[None]
     drift = driver.drift_std(BUDGETED["drift"])
     drift = directions.T @ own[:, : drift.size] * drift[None]
     if driver.drift is not None:  # later changes are further z
         std = driver.drift_std()
-        drift = jnp.concatenate([jnp.zeros_like(drift), jnp.eye(std.size)])
-        later = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
-        directions = jnp.concatenate([directions, later], axis=1)
+        drift = xp.concatenate([xp.zeros_like(drift), xp.eye(std.size)])
+        later = xp.pad(xp.diag(std), ((0, c.size - std.size), (0, 0)))
+        directions = xp.concatenate([directions, later], axis=1)
         mean, unstated = (
-            jnp.concatenate([of, jnp.zeros((std.size, *of.shape[1:]))]) for of in (mean, unstated)
+            xp.concatenate([of, xp.zeros((std.size, *of.shape[1:]))]) for of in (mean, unstated)
         )
-        cov = jax.scipy.linalg.block_diag(cov, jnp.eye(std.size))
+        cov = xp.pad(cov, (0, std.size)) + np.diag(np.arange(len(cov) + std.size) >= len(cov))
     found = around(calibrations, c, directions, frequency, shared, mean, cov)
     if found.gain_slopes is not None:  # the calibrations tell nothing about later changes
-        gain_slopes = found.gain_slopes.at[c.size :].set(0.0)
+        own = np.arange(len(found.gain_slopes)) < c.size
+        gain_slopes = xp.where(own[:, None, None], found.gain_slopes, 0.0)
         found = dataclasses.replace(found, gain_slopes=gain_slopes)
     bend = None
     if told is not None and calibrations.calibration.r_load.size == 1:
@@ -297,21 +300,22 @@ def given(
         v = s * as_complex(every.following(linear)[unknowns - 1, -1] / calibrations.rate)
         inverse = as_complex(resistance) * reciprocal(found.loaded)
         bend = u * u + 2 * u * v * inverse - (u * inverse) ** 2
-    by_z = jnp.pad(directions[unknowns:].T, ((0, 0), (0, at.size - c.size)))
+    by_z = xp.pad(directions[unknowns:].T, ((0, 0), (0, at.size - c.size)))
     errors = InstrumentErrors(
         at[unknowns:], by_z, unstated, ((1 - stated) * sizes)[:FAULTS], drift, told
     )
     return dataclasses.replace(found, shape=shape_of(driver, frequency), errors=errors, bend=bend)
 
 
+@array_function
 def around(
     calibrations: Calibrations,
-    c: Float[Array, " common"],
-    directions: Float[Array, "common z"],
-    frequency: Float[Array, " harmonic"],
+    c: Float[AnyArray, " common"],
+    directions: Float[AnyArray, "common z"],
+    frequency: Float[AnyArray, " harmonic"],
     shared: bool,
-    mean: Float[Array, " z"],
-    cov: Float[Array, "z z"],
+    mean: Float[AnyArray, " z"],
+    cov: Float[AnyArray, "z z"],
 ) -> GivenDriver:
     """A driver around the common parameters c, with z along `directions`; like `given`."""
     resistance = calibrations.calibration.r_load.mean()
@@ -331,7 +335,7 @@ def around(
     return GivenDriver(
         frequency=frequency,
         loaded=loaded,
-        w_slope=-jnp.sum(by_source[source.log_omegas], axis=0),
+        w_slope=-by_source[source.log_omegas].sum(0),
         slope=combined(directions[: by_source.shape[0]].T, by_source),
         resistance=resistance,
         mean=mean,

@@ -22,9 +22,10 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.profile import excess
 from etid.likelihood.unloaded import OTHER, SAME_FREQUENCY, SEEN, SIZE, SMOOTH
+from etid.precision import array_function, namespace
 from etid.results.driver import HarmonicDriver
 from etid.signals.harmonics import Spectrum, signal_share
-from etid.signals.transfer import as_complex, power, turns
+from etid.signals.transfer import AnyArray, as_complex, power, turns
 
 DEGREE = 6  # polynomials of δ; its real part has no constant, because that is the amplitude
 FIRST = 6  # first harmonics, which are not used because of hum and drift
@@ -48,12 +49,12 @@ class UnloadedShape(NamedTuple):
         drift: Difference that the drift of the driver makes, relative to V_th.
     """
 
-    frequency: Float[Array, " harmonic"]
-    x: Complex[Array, " harmonic"]
-    variance: Float[Array, " harmonic"]
-    directions: Float[Array, "direction part"]
-    bias: Float[Array, " direction"]
-    drift: Float[Array, ""]
+    frequency: Float[AnyArray, " harmonic"]
+    x: Complex[AnyArray, " harmonic"]
+    variance: Float[AnyArray, " harmonic"]
+    directions: Float[AnyArray, "direction part"]
+    bias: Float[AnyArray, " direction"]
+    drift: Float[AnyArray, ""]
 
     def differs(self, spectrum: Spectrum) -> Bool[Array, ""]:
         """Whether the unloaded voltage of a recording shows that the driver has changed."""
@@ -91,27 +92,30 @@ class UnloadedShape(NamedTuple):
         return jax.lax.cond(seen, in_its_noise, lambda _: jnp.array(False), None)
 
 
-def shape(spectrum: Spectrum, drift: Float[Array | np.ndarray, ""] | None = None) -> UnloadedShape:
+@array_function
+def shape(spectrum: Spectrum, drift: Float[AnyArray, ""] | None = None) -> UnloadedShape:
     """The unloaded voltage of a calibration whose driver has this drift."""
-    f, size = spectrum.frequency, spectrum.x.shape[0]
+    xp, f, size = namespace(spectrum.x), spectrum.frequency, spectrum.x.shape[0]
     clear = signal_share(spectrum.x, spectrum.variance_x) > SIGNAL
-    used = spectrum.selected & clear & (jnp.arange(size) >= FIRST)
-    x = jnp.where(used, spectrum.x, 0)
-    u = 2 * jnp.log(f / f[0]) / jnp.log(f[-1] / f[0]) - 1
-    smooth = jnp.stack([jnp.cos(n * jnp.arccos(jnp.clip(u, -1, 1))) for n in range(DEGREE)])
-    by_delta = as_complex(smooth) * x[None, :]
-    by_delay = x * jax.lax.complex(jnp.zeros(size), f / f[-1])
-    rows = jnp.concatenate([x[None], by_delay[None], by_delta[1:], by_delta * 1j])
-    real = jnp.concatenate([rows.real, rows.imag], axis=1)
-    directions = jnp.linalg.qr(real.T)[0].T[2:]
+    used = spectrum.selected & clear & (np.arange(size) >= FIRST)
+    x = xp.where(used, spectrum.x, 0)
+    u = 2 * xp.log(f / f[0]) / xp.log(f[-1] / f[0]) - 1
+    smooth = xp.stack([xp.cos(n * xp.arccos(xp.clip(u, -1, 1))) for n in range(DEGREE)])
+    by_delta = smooth * x
+    by_delay = 1j * x * f / f[-1]
+    rows = xp.concatenate([x[None], by_delay[None], by_delta[1:], by_delta * 1j])
+    real = xp.concatenate([rows.real, rows.imag], axis=1)
+    directions = xp.linalg.qr(real.T)[0].T[2:]
     # Σ Re (q/x)* σ²: a direction q is x times a function of frequency; the difference contains −x.
-    share = jnp.where(used, spectrum.variance_x / jnp.where(used, power(x), 1.0), 0.0)
-    bias = directions @ (jnp.concatenate([x.real, x.imag]) * jnp.tile(share, 2))
-    made = jnp.asarray(DRIFT * (0.0 if drift is None else drift))
+    share = xp.where(used, spectrum.variance_x / xp.where(used, power(x), 1.0), 0.0)
+    bias = directions @ (xp.concatenate([x.real, x.imag]) * xp.tile(share, 2))
+    made = xp.asarray(DRIFT * (0.0 if drift is None else drift))
     return UnloadedShape(f, x, spectrum.variance_x, directions, bias, made)
 
 
-def shape_of(driver: HarmonicDriver, frequency: Float[Array, " harmonic"]) -> UnloadedShape | None:
+def shape_of(
+    driver: HarmonicDriver, frequency: Float[AnyArray, " harmonic"]
+) -> UnloadedShape | None:
     """The unloaded voltage of the first calibration of a driver, for loads of these harmonics [Hz].
 
     None if the driver has another number of harmonics than the loads.
