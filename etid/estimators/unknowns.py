@@ -57,24 +57,3 @@ class Nuisance(eqx.Module):
     def of(cls, vector: Float[Array, "*lane nuisance"]) -> "Nuisance":
         """The unknowns from the vector of a solver."""
         return cls(vector[..., :-2], vector[..., -2], vector[..., -1])
-
-
-class DriverUnknowns(eqx.Module):
-    """Unknowns of a driver and its calibrations.
-
-    Attributes:
-        source: Parameters of Z_th, flattened in field order.
-        delay_samples: Trigger delay of each calibration [samples].
-    """
-
-    source: Float[Array, " source"]
-    delay_samples: Float[Array, " record"]
-
-    @classmethod
-    def of(cls, vector: Float[Array, " common"], records: int) -> "DriverUnknowns":
-        """The unknowns from the vector of a solver."""
-        return cls(vector[:-records], vector[-records:])
-
-    def vector(self) -> Float[Array, " common"]:
-        """The vector for a solver."""
-        return jnp.concatenate([self.source, self.delay_samples])

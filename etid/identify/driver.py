@@ -275,7 +275,7 @@ def _identified(
     estimator: AbstractEstimator,
     instrument: Instrument | None,
 ) -> Driver:
-    if isinstance(estimator, MaximumLikelihood):
+    if isinstance(estimator, MaximumLikelihood) and isinstance(lanes, Harmonics):
         return jax.device_put(estimator.fit_driver(lanes, r_load, order, instrument))
     return _traced(lanes, r_load, order, estimator, instrument)
 

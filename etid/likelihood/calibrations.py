@@ -121,7 +121,7 @@ class Calibrations:
         return self.source.log_omega.shape[0]
 
     @property
-    def terms(self) -> float:
+    def terms(self) -> Float[AnyArray, ""]:
         """Number of real terms of the records."""
         return 2.0 * self.spectra.selected.sum()
 

@@ -65,10 +65,10 @@ class NormalEquations(NamedTuple):
         scale: Float[AnyArray, "*row q"] | None = None,
     ) -> Float[AnyArray, "*row q"]:
         """−(JᵀJ + damping · D²)⁻¹ Jᵀr, where D is the scale."""
-        xp, scale = namespace(self.matrix), self.scale if scale is None else scale
-        ridge = xp.asarray(damping + RIDGE)[..., None, None] * np.eye(scale.shape[-1])
-        scaled = self.matrix / scale[..., :, None] / scale[..., None, :] + ridge
-        return -xp.linalg.solve(scaled, (self.gradient / scale)[..., None])[..., 0] / scale
+        xp, by = namespace(self.matrix), self.scale if scale is None else scale
+        ridge = xp.asarray(damping + RIDGE)[..., None, None] * np.eye(by.shape[-1])
+        scaled = self.matrix / by[..., :, None] / by[..., None, :] + ridge
+        return -xp.linalg.solve(scaled, (self.gradient / by)[..., None])[..., 0] / by
 
     def promised(self, step: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row"]:
         """Reduction of the objective by a Gauss-Newton step."""
