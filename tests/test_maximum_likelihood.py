@@ -188,7 +188,7 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
 
 def test_the_search_at_the_knots_ends_at_the_minimum_of_all_harmonics(study, driver):
     lane = Harmonics.of(Inspected(study["loaded/0"]))
-    known = known_of(lane, driver, True, MAXIMUM_LIKELIHOOD)
+    known = jax.device_put(known_of(lane, driver, True, MAXIMUM_LIKELIHOOD))
     own = jnp.log(jnp.array([30e3, 150e3, 0.2e-9])), jnp.array([0.3])
     start = jnp.concatenate([*own, known.mean])
 

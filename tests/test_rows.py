@@ -15,7 +15,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import Gains
-from etid.likelihood.linear import NormalEquations, levenberg_marquardt
+from etid.likelihood.linear import LevenbergMarquardt, NormalEquations
 from etid.likelihood.profile import Profile, Records
 from etid.likelihood.search import Near, minimum
 from etid.likelihood.starts import starts
@@ -164,33 +164,36 @@ def test_condensed_terms_have_the_slope_of_all_harmonics(study, driver):
         np.testing.assert_allclose(gradient[:, number], (up - down) / 2e-5, rtol=0.05, atol=5.0)
 
 
-def test_levenberg_marquardt_finds_the_minimum_of_each_row():
-    """Rosenbrock's valley from several starts; each row ends where it would end alone."""
+class Valley:
+    """Rosenbrock's valley."""
 
-    def equations(q):
-        x, y = q[..., 0], q[..., 1]
-        terms = np.stack([10 * (y - x**2), 1 - x], -1)
-        rows = np.stack(
-            [np.stack([-20 * x, -1 + 0 * x], -1), np.stack([10 + 0 * x, 0 * x], -1)], -2
-        )
-        gradient = (rows @ terms[..., None])[..., 0]
-        return NormalEquations(0.5 * (terms**2).sum(-1), gradient, rows @ rows.swapaxes(-1, -2))
+    def terms(self, q):
+        return np.stack([10 * (q[..., 1] - q[..., 0] ** 2), 1 - q[..., 0]], -1)
 
-    first = np.array([[-1.2, 1.0], [3.0, -2.0], [0.5, 0.5], [np.nan, 1.0]])
-    enough = np.full(4, 1e-24)
+    def equations(self, q):
+        x, one = q[..., 0], np.ones_like(q[..., 0])
+        rows = np.stack([np.stack([-20 * x, -one], -1), np.stack([10 * one, 0 * x], -1)], -2)
+        return NormalEquations.of(self.terms(q), rows)
 
-    def row_of(number):
-        return equations(first[number : number + 1])
+    def of(self, rows):
+        del rows
+        return self
 
+
+@pytest.mark.parametrize("curved", [False, True])
+def test_levenberg_marquardt_finds_the_minimum_of_each_row(curved):
+    """From several starts each row ends where it would end alone."""
+    first, valley = np.array([[-1.2, 1.0], [3.0, -2.0], [0.5, 0.5], [np.nan, 1.0]]), Valley()
+    search = LevenbergMarquardt(1e-2, 200, curved=curved)
     with np.errstate(invalid="ignore"):
-        found = levenberg_marquardt(equations, first, equations(first), 1e-2, enough, 200)
-    np.testing.assert_allclose(found.q[:3], 1.0, atol=1e-9)
-    assert not found.moves.any()
-    for number in range(3):
-        alone = levenberg_marquardt(
-            equations, first[number : number + 1], row_of(number), 1e-2, enough[:1], 200
-        )
-        np.testing.assert_allclose(alone.q[0], found.q[number], atol=1e-12)
+        found = search(valley, first, valley.equations(first), np.full(4, 1e-24))
+        np.testing.assert_allclose(found.q[:3], 1.0, atol=1e-9)
+        assert not found.moves.any()
+        for number in range(3):
+            start = first[number : number + 1]
+            alone = search(valley, start, valley.equations(start), np.array([1e-24]))
+            np.testing.assert_allclose(alone.q[0], found.q[number], atol=1e-12)
+            assert alone.steps[0] == found.steps[number]
 
 
 def test_two_outputs_condense_to_the_exact_normal_equations():

@@ -65,8 +65,7 @@ def from_harmonics(
 ) -> HarmonicDriver:
     """Refine Z_th by maximum likelihood.
 
-    The fits from all starts use bands of harmonics. The best is refined with all harmonics of the
-    bands in which V_th exceeds its noise.
+    All harmonics are used of the bands in which V_th exceeds its noise.
     """
     spectrum, r_load = jax.tree.map(np.asarray, (records.spectrum, r_load))
     rate = np.asarray(records.sample_rate)[0]
@@ -78,14 +77,20 @@ def from_harmonics(
     calibration = Calibration(r_load, np.zeros(r_load.shape), delay_std(r_load))
     width = delay_width(instrument, rate)
     model = Calibrations(first, calibration, spectra, rate, width, instrument)
-    each = starts.vector()
-    delays = np.zeros((len(each), r_load.size))
-    found = driver.rough(model, bands, np.concatenate([each, delays], -1))
-    sources = jax.tree.map(lambda *of: np.stack(of), *map(model.source_of, found.q))
-    kept = found.q.shape[-1] - r_load.size
-    passive = _is_passive(sources, inverse(found.matrix)[:, :kept, :kept], rate)
-    ranked = np.argsort(_cost(sources, found.cost, passive), kind="stable")
-    model, near, least, start = driver.identified(model, found, ranked.tolist())
+    if r_load.size == 1:  # a single calibration does not show errors of the instrument
+        model = dataclasses.replace(model, instrument=None)
+    vectors = starts.vector()
+    delays = np.zeros((len(vectors), r_load.size))
+    q, steps = driver.brought_near(model, bands, np.concatenate([vectors, delays], -1))
+    least = driver.minimum(model, np.pad(q, ((0, 0), (0, model.tolerances.size))))
+    sources = jax.tree.map(lambda *of: np.stack(of), *map(model.source_of, least.q))
+    kept = model.parameters(least.q[0]).size
+    passive = _is_passive(sources, inverse(least.matrix)[:, :kept, :kept], rate)
+    costs = _cost(sources, driver.cost(model, least), passive)
+    start = int(np.argmin(costs + np.where(least.settled, 0.0, UNWANTED)))
+    least = least._replace(points=least.points + steps)
+    least = driver.Minimum(*(of[start] for of in least))
+    model, near = model.at(least.q), model.near(least.q)
     linear = model.linear(near)
     cov = linear.first(model.unknowns).covariance()[:kept, :kept]  # at these errors
     statistic = np.nanmax(of_calibrations.missing_pole(model, near, linear))

@@ -107,6 +107,13 @@ class Calibrations:
         of, count = self.instrument, self.calibration.r_load.shape[0]
         return np.zeros(0) if of is None else of.deviations(count)
 
+    def at(self, common: Float[AnyArray, " common"]) -> "Calibrations":
+        """The same with these parameters as those that were identified."""
+        errors = None if self.instrument is None else self.errors(common)
+        delays = self.delays(common)
+        of = dataclasses.replace(self.calibration, delay_samples=delays, errors=errors)
+        return dataclasses.replace(self, source=self.source_of(common), calibration=of)
+
     @functools.cached_property
     def unknowns(self) -> int:
         """Number of parameters of Z_th and of delays, which the errors of the instrument follow."""

@@ -1,83 +1,107 @@
-"""The driver of some calibrations: all starts side by side, then the best with all harmonics.
+"""The driver of some calibrations, from several starts side by side.
 
-The starts use bands of harmonics (`etid.signals.knots`), which is near enough to tell which of them
-leads to the deepest minimum. None is left out on the way: after ten steps the one that wins is not
-among the best two in a sixth of all calibrations. From a distant start, the derivatives of the
-terms themselves, which contain their noise, find deeper minima than those with X̂.
+Some steps with bands of harmonics (`etid.signals.knots`) bring the starts near their minima. From a
+distant start, the derivatives of the terms themselves, which contain their noise, find deeper
+minima than those with X̂. Then each goes to its minimum with all harmonics, by successive
+approximations like those of `etid.likelihood.search`, and the deepest is the driver. None is left
+out on the way: the start that is behind after a hundred steps may be the one that ends deepest.
 
-Z_th and a delay form a curved valley, along which a fit creeps. So the last steps, at the knots,
-follow its curvature: they take a quarter of the steps.
+Z_th and a delay form a curved valley, along which a fit creeps. So the steps at the knots follow
+its curvature: there are a quarter as many.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from etid.likelihood.calibrations import Calibrations, Near
-from etid.likelihood.linear import NormalEquations, levenberg_marquardt, repeated
-from etid.likelihood.search import BEFORE, IDLE, NO_BETTER, POINTS, ROUNDING, WELL, select
+from etid.likelihood.linear import (
+    LevenbergMarquardt,
+    NormalEquations,
+    repeated,
+    replaced,
+    taken,
+)
+from etid.likelihood.search import (
+    BEFORE,
+    IDLE,
+    NO_BETTER,
+    POINTS,
+    ROUNDING,
+    WELL,
+    select,
+)
 from etid.precision import array_function, namespace
 from etid.signals.harmonics import Spectrum, real_parts
 from etid.signals.transfer import AnyArray, as_complex, power
 
-ROUGHLY = 0.2  # [standard errors] length of the last steps of a rough fit
-ROUGH_STEPS = 100  # a start that still creeps along the valley is compared as it is
+ROUGHLY = 0.2  # [standard errors] length of the last steps with bands
+ROUGH_STEPS = 60  # with bands; more of them spare the search at the knots no steps
 PATIENCE = 3  # short steps that end a search: a step after a rejected one is short, too
 MAX_STEPS = 500  # at the knots of one point
 
 
-class Rough(NamedTuple):
-    """The minima with bands of harmonics, near those with all harmonics.
+@dataclasses.dataclass(frozen=True)
+class _Bands:
+    """The terms of all bands, with their own derivatives."""
 
-    Attributes:
-        q: Parameters of Z_th, and delays.
-        matrix: Curvature.
-        cost: −2 ln likelihood per degree of freedom, but for a constant.
-        steps: Number of steps.
-    """
+    model: Calibrations
 
-    q: Float[AnyArray, "start q"]
-    matrix: Float[AnyArray, "start q q"]
-    cost: Float[AnyArray, "start"]
-    steps: Int[AnyArray, "start"]
-
-
-@array_function
-def rough(model: Calibrations, bands: Spectrum, starts: Float[AnyArray, "start q"]) -> Rough:
-    """The minima of all starts, with bands of the harmonics of the calibrations.
-
-    Each calibration has an X of its own here, as if no two shared an unloaded record.
-    """
-    xp, model = namespace(starts), dataclasses.replace(model, instrument=None)
-    of = dataclasses.replace(model, spectra=bands)
-    x, y, used = bands.x, bands.y, bands.selected
-    variance_x, variance_y = bands.variance_x, bands.variance_y
-
-    def equations(q: Float[AnyArray, "start q"]) -> NormalEquations:
-        slopes, (weak, by_weak) = of.slopes(q), of.weak(q)
-        expected = variance_y + power(slopes.gains) * variance_x
-        scale = as_complex(xp.where(used, xp.sqrt(2 / expected), 0.0))
-        missed = (y - slopes.gains * x) * scale
+    def equations(self, q: Float[AnyArray, "*row q"]) -> NormalEquations:
+        xp, s = namespace(q), self.model.spectra
+        slopes, (weak, by_weak) = self.model.slopes(q), self.model.weak(q)
+        expected = s.variance_y + power(slopes.gains) * s.variance_x
+        scale = as_complex(xp.where(s.selected, xp.sqrt(2 / expected), 0.0))
+        missed = (s.y - slopes.gains * s.x) * scale
         # A change of a gain also changes the variance that its term is scaled by.
-        towards = xp.conj(slopes.gains) * as_complex(variance_x / expected)
-        rows = slopes.by_q * (-x * scale)[..., None, :, :]
+        towards = xp.conj(slopes.gains) * as_complex(s.variance_x / expected)
+        rows = slopes.by_q * (-s.x * scale)[..., None, :, :]
         rows = rows - missed[..., None, :, :] * (slopes.by_q * towards[..., None, :, :]).real
         flat = [real_parts(each.reshape(*each.shape[:-2], -1)) for each in (missed, rows)]
         terms, rows = xp.concatenate([flat[0], weak], -1), xp.concatenate([flat[1], by_weak], -1)
         return NormalEquations.of(terms, rows)
 
-    first = equations(starts)
-    enough = xp.zeros_like(first.objective) + 0.5 * ROUGHLY**2
-    found = levenberg_marquardt(equations, starts, first, 1e-2, enough, ROUGH_STEPS, PATIENCE)
-    # A spurious resonance fits noise, so that it lowers Σ r²; but it raises the variances.
-    s, gains = model.spectra, model.gains(found.q)
-    logs = xp.log(s.variance_y + power(gains) * s.variance_x)
-    logs = xp.where(s.selected, logs, 0.0).sum((-2, -1))
-    cost = (found.equations.objective + logs) / model.terms
-    return Rough(found.q, found.equations.matrix, cost, found.steps)
+    def of(self, rows: np.ndarray) -> "_Bands":
+        del rows  # all starts are of the same calibrations
+        return self
+
+
+@dataclasses.dataclass(frozen=True)
+class _Knots:
+    """Condensed terms near a point."""
+
+    model: Calibrations
+    near: Near
+
+    def terms(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row term"]:
+        at = self.near.condensed.terms(self.model.gains(q, self.model.knots))
+        return namespace(q).concatenate([at, self.model.weak(q)[0]], -1)
+
+    def equations(self, q: Float[AnyArray, "*row q"]) -> NormalEquations:
+        xp, condensed = namespace(q), self.near.condensed
+        slopes, (weak, by_weak) = self.model.slopes(q, self.model.knots), self.model.weak(q)
+        at = xp.concatenate([condensed.terms(slopes.gains), weak], -1)
+        rows = xp.concatenate([condensed.rows(slopes.by_q), by_weak], -1)
+        return NormalEquations.of(at, rows)
+
+    def of(self, rows: np.ndarray) -> "_Knots":
+        return _Knots(self.model, taken(self.near, rows))
+
+
+@array_function
+def brought_near(
+    model: Calibrations, bands: Spectrum, starts: Float[AnyArray, "start q"]
+) -> tuple[Float[AnyArray, "start q"], Int[AnyArray, "start"]]:
+    """Points near the minima of the starts, and the steps to them, with bands of the harmonics.
+
+    Each calibration has an X of its own here, as if no two shared an unloaded record.
+    """
+    problem = _Bands(dataclasses.replace(model, spectra=bands, instrument=None))
+    search = LevenbergMarquardt(1e-2, ROUGH_STEPS, PATIENCE)
+    found = search(problem, starts, problem.equations(starts), 0.5 * ROUGHLY**2)
+    return found.q, found.steps
 
 
 class Minimum(NamedTuple):
@@ -86,12 +110,14 @@ class Minimum(NamedTuple):
     Attributes:
         q: The common parameters.
         objective: ½ Σ r² next to it.
+        matrix: Curvature there.
         settled: Whether it is a minimum.
         points: Number of points of the search.
     """
 
     q: Float[AnyArray, "*row q"]
     objective: Float[AnyArray, "*row"]
+    matrix: Float[AnyArray, "*row q q"]
     settled: Bool[AnyArray, "*row"]
     points: Int[AnyArray, "*row"]
 
@@ -101,6 +127,7 @@ class _State(NamedTuple):
 
     near: Near
     objective: Float[AnyArray, "*row"]
+    matrix: Float[AnyArray, "*row q q"]
     target: Float[AnyArray, "*row q"]
     trial: Float[AnyArray, "*row q"]
     settled: Bool[AnyArray, "*row"]
@@ -111,42 +138,28 @@ class _State(NamedTuple):
 
 @array_function
 def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
-    """The minimum of the likelihood of all harmonics, by successive approximations.
-
-    The approximations are those of `etid.likelihood.search`.
-    """
-    xp, every = namespace(start), model.knots
+    """The minimum of the likelihood of all harmonics."""
+    xp = namespace(start)
 
     def evaluated(q: Float[AnyArray, "*row q"]) -> tuple[Near, Float[AnyArray, "*row"]]:
         near, (weak, _) = model.near(q), model.weak(q)
         return near, near.objective + 0.5 * (weak**2).sum(-1)
 
-    def followed(near: Near, unit: Float[AnyArray, "*row"]) -> tuple[AnyArray, AnyArray]:
-        """The minimum at the knots, and what it promises."""
-
-        def terms(q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row term"]:
-            at = near.condensed.terms(model.gains(q, every))
-            return xp.concatenate([at, model.weak(q)[0]], -1)
-
-        def equations(q: Float[AnyArray, "*row q"]) -> NormalEquations:
-            slopes, (weak, by_weak) = model.slopes(q, every), model.weak(q)
-            at = xp.concatenate([near.condensed.terms(slopes.gains), weak], -1)
-            rows = xp.concatenate([near.condensed.rows(slopes.by_q), by_weak], -1)
-            return NormalEquations.of(at, rows)
-
-        first, enough = equations(near.q), (WELL * BEFORE) ** 2 * unit
-        of = equations, near.q, first, 1e-6, enough, MAX_STEPS, PATIENCE, terms
-        found = levenberg_marquardt(*of)
+    def followed(near: Near, unit: Float[AnyArray, "*row"]) -> tuple[AnyArray, ...]:
+        """The minimum at the knots, what it promises, and the curvature there."""
+        problem = _Knots(model, near)
+        first, enough = problem.equations(near.q), (WELL * BEFORE) ** 2 * unit
+        found = LevenbergMarquardt(1e-6, MAX_STEPS, PATIENCE, True)(problem, near.q, first, enough)
         # A fit that did not settle promises everything: it is at no minimum.
         left = xp.where(found.moves, -np.inf, found.equations.objective)
-        return found.q, first.objective - left
+        return found.q, first.objective - left, found.equations.matrix
 
     def going(
         near: Near, objective: AnyArray, better: AnyArray, reduced: AnyArray, state: AnyArray
     ) -> _State:
         idle, points = state
         unit = objective / model.terms
-        target, promised = followed(near, unit)
+        target, promised, matrix = followed(near, unit)
         stays = ~better & (promised <= NO_BETTER**2 * unit)
         target = xp.where(stays[..., None], near.q, target)
         promised = xp.where(stays, 0.0, promised)
@@ -156,9 +169,12 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
         trial = xp.where(xp.isfinite(trial).all(-1)[..., None], trial, near.q)
         settled = (promised <= BEFORE**2 * unit) | (idle >= IDLE)
         moves = ~settled & xp.isfinite(objective)
-        return _State(near, objective, target, trial, settled, idle, points + 1, moves)
+        return _State(near, objective, matrix, target, trial, settled, idle, points + 1, moves)
 
     def step(state: _State) -> _State:
+        if xp is np and start.ndim > 1 and not state.moves.all():
+            live = np.flatnonzero(state.moves)
+            return replaced(state, live, step(taken(state, live)))
         near, objective = evaluated(state.trial)
         reduced = state.objective - objective
         better = reduced >= 0
@@ -172,44 +188,16 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
     first = going(near, objective, better, xp.zeros_like(objective), (none, none))
     last = repeated(step, first, POINTS - 1)
     q = xp.where(last.settled[..., None], last.target, last.near.q)
-    return Minimum(q, last.objective, last.settled, last.points)
+    return Minimum(q, last.objective, last.matrix, last.settled, last.points)
 
 
-class Identified(NamedTuple):
-    """A driver that was identified.
+@array_function
+def cost(model: Calibrations, least: Minimum) -> Float[AnyArray, "*row"]:
+    """−2 ln likelihood per degree of freedom, but for a constant, by which starts compete.
 
-    Attributes:
-        model: The calibrations with its Z_th, delays and errors.
-        near: Their likelihood at its minimum.
-        least: The minimum; it counts the steps of the start, too.
-        start: Number of the start that led here.
+    A spurious resonance fits noise, so that it lowers Σ r²; but it raises the variances.
     """
-
-    model: Calibrations
-    near: Near
-    least: Minimum
-    start: int
-
-
-def identified(model: Calibrations, found: Rough, ranked: Sequence[int]) -> Identified:
-    """The driver from the best start; the others are tried only if it does not converge.
-
-    Several calibrations show errors of the instrument, which are then unknowns, too; behind one
-    they are 0. If no start converges, the result is that of the best.
-    """
-    if model.calibration.r_load.shape[0] == 1:
-        model = dataclasses.replace(model, instrument=None)
-    none = np.zeros_like(model.tolerances)
-    tried = []
-    for number in ranked:
-        least = minimum(model, np.concatenate([found.q[number], none]))
-        tried.append((least._replace(points=least.points + found.steps[number]), number))
-        if least.settled:
-            break
-    least, start = tried[-1] if tried[-1][0].settled else tried[0]
-    q = least.q
-    errors = None if model.instrument is None else model.errors(q)
-    of = dataclasses.replace(model.calibration, delay_samples=model.delays(q), errors=errors)
-    near = model.near(q)
-    model = dataclasses.replace(model, source=model.source_of(q), calibration=of)
-    return Identified(model, near, least, start)
+    xp, s, gains = namespace(least.q), model.spectra, model.gains(least.q)
+    logs = xp.log(s.variance_y + power(gains) * s.variance_x)
+    logs = xp.where(s.selected, logs, 0.0).sum((-2, -1))
+    return (least.objective + logs) / model.terms

@@ -8,8 +8,9 @@ along a step, half of the step that r″ alone would cause is added (Transtrum a
 arXiv:1201.5885).
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import jax
 import numpy as np
@@ -17,6 +18,8 @@ from jaxtyping import Bool, Float, Int
 
 from etid.precision import namespace
 from etid.signals.transfer import AnyArray
+
+Arrays = TypeVar("Arrays")
 
 RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
 SMALLEST = 1e-12  # the same for an inverse
@@ -94,13 +97,36 @@ def _scale(matrix: Float[AnyArray, "*row q q"]) -> Float[AnyArray, "*row q"]:
     return xp.where(scale > 0, scale, 1.0)
 
 
+@runtime_checkable
+class Problem(Protocol):
+    """Terms of rows to minimise."""
+
+    def equations(self, q: Float[AnyArray, "*row q"]) -> NormalEquations:
+        """The normal equations at a point."""
+        ...
+
+    def of(self, rows: Int[np.ndarray, " some"]) -> "Problem":
+        """Some of the rows."""
+        ...
+
+
+@runtime_checkable
+class Curved(Problem, Protocol):
+    """Terms whose curvature steps can follow."""
+
+    def terms(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row term"]:
+        """The terms at a point."""
+        ...
+
+
 class State(NamedTuple):
     """Where Levenberg-Marquardt is.
 
     Attributes:
         q: The best point.
         equations: The normal equations there.
-        scale: Largest scale of them so far.
+        enough: Reduction of the objective by a step, below which a row may be at its minimum.
+        scale: Largest scale of the equations so far.
         damping: Damping of the next step, relative to the diagonal.
         idle: Steps in a row that have not reduced the objective by more than is enough.
         move: The next step.
@@ -110,6 +136,7 @@ class State(NamedTuple):
 
     q: Float[AnyArray, "*row q"]
     equations: NormalEquations
+    enough: Float[AnyArray, "*row"]
     scale: Float[AnyArray, "*row q"]
     damping: Float[AnyArray, "*row"]
     idle: Int[AnyArray, "*row"]
@@ -118,72 +145,87 @@ class State(NamedTuple):
     steps: Int[AnyArray, "*row"]
 
 
-Equations = Callable[[Float[AnyArray, "*row q"]], NormalEquations]
-Terms = Callable[[Float[AnyArray, "*row q"]], Float[AnyArray, "*row term"]]
-
-
-def levenberg_marquardt(
-    equations: Equations,
-    start: Float[AnyArray, "*row q"],
-    first: NormalEquations,
-    damping: float,
-    enough: Float[AnyArray, "*row"],
-    steps: int,
-    patience: int = 1,
-    curved: Terms | None = None,
-) -> State:
+@dataclasses.dataclass(frozen=True)
+class LevenbergMarquardt:
     """The minimum of a few terms.
 
-    Args:
-        equations: The normal equations at a point.
-        start: The first point.
-        first: The normal equations there.
+    Attributes:
         damping: Damping of the first step.
-        enough: Reduction of the objective by a step, below which a row may be at its minimum.
         steps: Largest number of steps.
-        patience: So many such steps in a row end the search; the last is not taken.
-        curved: The terms at a point, if steps are to follow their curvature.
+        patience: So many steps in a row that bring no more than is enough end the search; the last
+            of them is not taken.
+        curved: Whether steps follow the curvature of the terms, which are then `Curved`.
     """
-    xp = namespace(start)
 
-    def proposed(state: State) -> State:
-        at = state.equations
+    damping: float
+    steps: int
+    patience: int = 1
+    curved: bool = False
+
+    def __call__(
+        self,
+        problem: Problem,
+        start: Float[AnyArray, "*row q"],
+        first: NormalEquations,
+        enough: Float[AnyArray, "*row"] | float,
+    ) -> State:
+        """The minimum from a first point, where the normal equations are known."""
+        xp = namespace(start)
+        none = xp.zeros_like(first.objective)
+        counted, finite = xp.zeros(none.shape, int), xp.isfinite(first.objective)
+        of = enough + none, xp.zeros_like(start), self.damping + none, counted, start
+        state = self._proposed(problem, State(start, first, *of, finite, counted))
+        if xp is np:
+            return self._row_by_row(problem, state)
+        return repeated(lambda state: self._step(problem, state), state, self.steps)
+
+    def _row_by_row(self, problem: Problem, whole: State) -> State:
+        """Steps of the rows that still move, in NumPy."""
+        state, rows = whole, None
+        for _ in range(self.steps):
+            if not state.moves.all():
+                live = np.flatnonzero(state.moves)
+                whole = state if rows is None else replaced(whole, rows, state)
+                if not live.size:
+                    return whole
+                rows = live if rows is None else rows[live]
+                problem, state = problem.of(live), taken(state, live)
+            state = self._step(problem, state)
+        return state if rows is None else replaced(whole, rows, state)
+
+    def _proposed(self, problem: Problem, state: State) -> State:
+        xp, at = namespace(state.q), state.equations
         scale = xp.maximum(state.scale, at.scale)
         move = at.step(state.damping, scale)
-        ends = state.idle + (at.promised(move) <= enough) >= patience
-        moves = state.moves & ~ends
-        if curved is not None:
-            bent = at._replace(gradient=_bend(curved, state.q, at, move))
+        ends = state.idle + (at.promised(move) <= state.enough) >= self.patience
+        if self.curved:
+            bent = at._replace(gradient=_bend(cast("Curved", problem), state.q, at, move))
             turned = 0.5 * bent.step(state.damping, scale)
             sizes = [xp.sqrt(((one * scale) ** 2).sum(-1)) for one in (turned, move)]
             small = 4 * sizes[0] <= ACCELERATION * sizes[1]
             move = move + xp.where(small[..., None], turned, 0.0)
-        return state._replace(scale=scale, move=move, moves=moves)
+        return state._replace(scale=scale, move=move, moves=state.moves & ~ends)
 
-    def step(state: State) -> State:
+    def _step(self, problem: Problem, state: State) -> State:
+        xp = namespace(state.q)
         trial = xp.where(state.moves[..., None], state.q + state.move, state.q)
-        new, old = equations(trial), state.equations
+        new, old = problem.equations(trial), state.equations
         promised, reduced = old.promised(state.move), old.objective - new.objective
         finite = xp.isfinite(new.gradient).all(-1)
         better = state.moves & finite & (reduced >= 0)
         good = better & (reduced >= GOOD * promised)
         damping = xp.where(better, state.damping, xp.maximum(state.damping, LEAST) * 4)
         damping = xp.where(good, 0.2 * state.damping, damping)
-        small = xp.maximum(promised, reduced) <= enough
+        small = xp.maximum(promised, reduced) <= state.enough
         idle = xp.where(better, xp.where(small, state.idle + 1, 0), state.idle)
         q, *kept = chosen(better, (trial, *new), (state.q, *old))
-        count = state.steps + state.moves
-        found = state._replace(q=q, damping=damping, idle=idle, steps=count)
-        return proposed(found._replace(equations=NormalEquations(*kept)))
-
-    none = xp.zeros_like(first.objective)
-    of = xp.zeros_like(start), none + damping, xp.zeros(none.shape, int), start
-    finite, counted = xp.isfinite(first.objective), xp.zeros(none.shape, int)
-    return repeated(step, proposed(State(start, first, *of, finite, counted)), steps)
+        steps = state.steps + state.moves
+        found = state._replace(q=q, damping=damping, idle=idle, steps=steps)
+        return self._proposed(problem, found._replace(equations=NormalEquations(*kept)))
 
 
 def _bend(
-    terms: Terms,
+    problem: Curved,
     q: Float[AnyArray, "*row q"],
     at: NormalEquations,
     move: Float[AnyArray, "*row q"],
@@ -191,8 +233,25 @@ def _bend(
     """Jᵀ r″ along a step."""
     assert at.rows is not None
     slope = (at.rows * move[..., :, None]).sum(-2)
-    bent = 2 / DIFFERENCE * ((terms(q + DIFFERENCE * move) - at.terms) / DIFFERENCE - slope)
+    ahead = problem.terms(q + DIFFERENCE * move)
+    bent = 2 / DIFFERENCE * ((ahead - at.terms) / DIFFERENCE - slope)
     return (at.rows @ bent[..., None])[..., 0]
+
+
+def taken(of: Arrays, rows: np.ndarray) -> Arrays:
+    """Some rows of all arrays."""
+    return jax.tree.map(lambda leaf: leaf[rows], of)
+
+
+def replaced(of: Arrays, rows: np.ndarray, by: Arrays) -> Arrays:
+    """All arrays, some rows of which are replaced."""
+
+    def one(leaf: np.ndarray, other: np.ndarray) -> np.ndarray:
+        leaf = leaf.copy()  # the impedance of a resistor is one number at all frequencies
+        leaf[rows] = other
+        return leaf
+
+    return jax.tree.map(one, of, by)
 
 
 def chosen(

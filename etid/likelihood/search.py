@@ -7,22 +7,26 @@ between both. Mostly two or three points are enough.
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from etid.likelihood.gains import Gains, Slopes
-from etid.likelihood.linear import NormalEquations, chosen, levenberg_marquardt
+from etid.likelihood.linear import (
+    Arrays,
+    LevenbergMarquardt,
+    NormalEquations,
+    chosen,
+    replaced,
+    taken,
+)
 from etid.likelihood.profile import Condensed, Profile, Records
 from etid.likelihood.shared import Unloaded
 from etid.precision import array_function, namespace
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import AnyArray, as_complex, reciprocal
-
-_Arrays = TypeVar("_Arrays")
 
 POINTS = 100  # largest number of points; below 24 dB some fits take dozens
 BEFORE = 0.05  # [standard errors] largest distance to the minimum before the last step
@@ -163,6 +167,47 @@ def _equations(
     return NormalEquations(xp.where(finite, 0.5 * every, np.inf), gradient, matrix)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Knots:
+    """Condensed terms near a point, as a function of the parameters that are free."""
+
+    load: Load
+    at_knots: Gains
+    near: Near
+    free: np.ndarray
+
+    def equations(self, q: Float[AnyArray, "*row q"]) -> NormalEquations:
+        found, free = _equations(self.load, self.near, self.at_knots.slopes(q), q), self.free
+        if free.all():
+            return found
+        matrix = found.matrix * (free[:, None] & free) + np.diag(1.0 * ~free)
+        return found._replace(gradient=found.gradient * free, matrix=matrix)
+
+    def of(self, rows: np.ndarray) -> "_Knots":
+        of = self.load.of(rows), self.at_knots.of(rows), taken(self.near, rows)
+        return _Knots(*of, self.free)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Anew:
+    """Terms that are condensed anew at each point."""
+
+    load: Load
+    at_knots: Gains
+
+    def equations(self, q: Float[AnyArray, "*row q"]) -> NormalEquations:
+        return self.at(Near.of(self.load, self.at_knots, q))
+
+    def at(self, near: Near) -> NormalEquations:
+        """The normal equations where the likelihood is known."""
+        found, xp = _equations(self.load, near, near.slopes, near.q), namespace(near.q)
+        objective = xp.where(xp.isfinite(found.objective), near.objective, np.inf)
+        return found._replace(objective=objective)
+
+    def of(self, rows: np.ndarray) -> "_Anew":
+        return _Anew(self.load.of(rows), self.at_knots.of(rows))
+
+
 class Minimum(NamedTuple):
     """The minimum and what is known of the best point, next to it.
 
@@ -267,17 +312,9 @@ def _approached(load: Load, at_knots: Gains, near: Near) -> Near:
 
     The likelihood is condensed anew at each step of Levenberg-Marquardt.
     """
-
-    def of(near: Near) -> NormalEquations:
-        found = _equations(load, near, near.slopes, near.q)
-        finite = namespace(near.q).isfinite(found.objective)
-        return found._replace(objective=namespace(near.q).where(finite, near.objective, np.inf))
-
-    def equations(q: Float[AnyArray, "*row q"]) -> NormalEquations:
-        return of(Near.of(load, at_knots, q))
-
-    enough = ROUGHLY * near.objective
-    found = levenberg_marquardt(equations, near.q, of(near), 1e-2, enough, STEPS)
+    problem = _Anew(load, at_knots)
+    search = LevenbergMarquardt(damping=1e-2, steps=STEPS)
+    found = search(problem, near.q, problem.at(near), ROUGHLY * near.objective)
     return Near.of(load, at_knots, found.q)
 
 
@@ -334,47 +371,22 @@ def _followed(
     at, scale = near.q, near.objective / load.records.terms
     own = np.arange(at.shape[-1]) < load.gains.owned
 
-    def equations(free: np.ndarray) -> Callable[[AnyArray], NormalEquations]:
-        def of(q: Float[AnyArray, "*row q"]) -> NormalEquations:
-            found = _equations(load, near, at_knots.slopes(q), q)
-            if free.all():
-                return found
-            matrix = found.matrix * (free[:, None] & free) + np.diag(1.0 * ~free)
-            return found._replace(gradient=found.gradient * free, matrix=matrix)
-
-        return of
-
-    q = xp.where(goes[..., None], at, target)
+    q, every = xp.where(goes[..., None], at, target), np.ones_like(own)
     distant = goes & (promised >= DISTANT * near.objective)
-    every = equations(np.ones_like(own))
+    problem = _Knots(load, at_knots, near, every)
     if xp is not np or distant.any():
-        enough, alone = xp.where(distant, ROUGHLY * near.objective, np.inf), equations(own)
-        q = levenberg_marquardt(alone, q, alone(q), 1e-2, enough, STEPS).q
-        here = every(q)
+        enough = xp.where(distant, ROUGHLY * near.objective, np.inf)
+        alone, first = dataclasses.replace(problem, free=own), LevenbergMarquardt(1e-2, STEPS)
+        q = first(alone, q, alone.equations(q), enough).q
+        here = problem.equations(q)
     enough = xp.where(goes, (WELL * BEFORE) ** 2 * scale, np.inf)
-    last = levenberg_marquardt(every, q, here, 1e-9, enough, STEPS)
+    last = LevenbergMarquardt(damping=1e-9, steps=STEPS)(problem, q, here, enough)
     # A fit that did not settle promises everything: it is at no minimum.
     left = xp.where(last.moves, -np.inf, last.equations.objective)
     return xp.where(goes[..., None], last.q, target), left
 
 
-def taken(of: _Arrays, rows: np.ndarray) -> _Arrays:
-    """Some rows of all arrays."""
-    return jax.tree.map(lambda leaf: leaf[rows], of)
-
-
-def replaced(of: _Arrays, rows: np.ndarray, by: _Arrays) -> _Arrays:
-    """All arrays, some rows of which are replaced."""
-
-    def one(leaf: np.ndarray, other: np.ndarray) -> np.ndarray:
-        leaf = leaf.copy()  # the impedance of a resistor is one number at all frequencies
-        leaf[rows] = other
-        return leaf
-
-    return jax.tree.map(one, of, by)
-
-
-def select(rows: Bool[AnyArray, "*row"], new: _Arrays, old: _Arrays) -> _Arrays:
+def select(rows: Bool[AnyArray, "*row"], new: Arrays, old: Arrays) -> Arrays:
     """All arrays, from `new` in these rows and from `old` in the others."""
     if isinstance(rows, np.ndarray):
         if rows.all():

@@ -9,15 +9,13 @@ from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.display import per_cent, plus_minus, quality, rounded, several
 from etid.circuits.impedance import Quantity
 from etid.circuits.overview import Overview, Overviewed
-from etid.numpy_tier.tiers import in_numpy
-from etid.precision import Module, namespace
+from etid.precision import Module, array_function, in_float64, namespace, untraced
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import texts
 from etid.recordings.study import Study
@@ -177,10 +175,11 @@ class Driver(AbstractFeed):
         drawn = importlib.import_module("etid.plotting")  # a higher layer
         return drawn.plot(self, calibration, axes=axes, size=size, title=title)
 
-    @in_numpy
-    def gain(self, load: Load, frequency: Quantity) -> Complex[Array, "..."]:
+    @in_float64
+    @array_function
+    def gain(self, load: Load, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """H = Z_L / (Z_L + Z_th)."""
-        z_load = jnp.asarray(load)
+        z_load = untraced(load)
         return z_load * reciprocal(z_load + self.response(frequency))
 
     def sensitivity(self, load: Load, frequency: Quantity) -> Complex[AnyArray, "..."]:
@@ -189,7 +188,7 @@ class Driver(AbstractFeed):
         return z_th * reciprocal(load + z_th)
 
     @abc.abstractmethod
-    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
+    def response(self, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """Source impedance Z_th(j 2π f) [Ω], in continuous time if the method gives it.
 
         Args:
@@ -200,11 +199,11 @@ class Driver(AbstractFeed):
         """
 
     @abc.abstractmethod
-    def log_response_stderr(self, frequency: Quantity) -> Float[Array, "2 ..."]:
+    def log_response_stderr(self, frequency: Quantity) -> Float[AnyArray, "2 ..."]:
         """Standard errors of ln |Z_th| and of the phase [rad]; NaN if there is no covariance."""
 
-    @in_numpy
-    def response_stderr(self, frequency: Quantity) -> Float[Array, "..."]:
+    @in_float64
+    def response_stderr(self, frequency: Quantity) -> Float[AnyArray, "..."]:
         """Standard error of |Z_th|, from the derivatives of |Z_th| by its parameters.
 
         Args:
@@ -213,7 +212,8 @@ class Driver(AbstractFeed):
         Returns:
             Standard errors [Ω]; NaN if the method gives no covariance.
         """
-        return jnp.abs(self.response(frequency)) * self.log_response_stderr(frequency)[0]
+        z_th = self.response(frequency)
+        return namespace(z_th).abs(z_th) * self.log_response_stderr(frequency)[0]
 
     @property
     def note(self) -> str:
@@ -260,16 +260,16 @@ class Driver(AbstractFeed):
 class DiscreteDriver(Driver):
     """A driver from Steiglitz-McBride: Z_th is the discrete filter `b`, `a` (paper, eq. 4)."""
 
-    @in_numpy
-    def response(self, frequency: Quantity) -> Complex[Array, "..."]:
+    @in_float64
+    @array_function
+    def response(self, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """Source impedance Z_th [Ω] of the discrete filter at real frequencies [Hz]."""
-        z = delay_variable(jnp.asarray(frequency, float), self.sample_rate)
-        return Rational(self.b, self.a)(z)
+        b, a, rate, at = untraced((self.b, self.a, self.sample_rate, frequency))
+        return Rational(b, a)(delay_variable(namespace(at).asarray(at, float), rate))
 
-    @in_numpy
-    def log_response_stderr(self, frequency: Quantity) -> Float[Array, "2 ..."]:
+    def log_response_stderr(self, frequency: Quantity) -> Float[AnyArray, "2 ..."]:
         """NaN: Steiglitz-McBride gives no covariance."""
-        return jnp.full((2, *jnp.asarray(frequency, float).shape), jnp.nan)
+        return np.full((2, *np.shape(frequency)), np.nan)
 
 
 class ContinuousDriver(Driver):
@@ -314,9 +314,12 @@ class ContinuousDriver(Driver):
         xp = namespace(vector)
         return xp.where(relative, xp.abs(vector), 1.0) * (own if drift is None else drift)
 
-    def later_cov(self) -> Float[Array, "parameter parameter"]:
+    def later_cov(self) -> Float[AnyArray, "parameter parameter"]:
         """Covariance of the parameters of `source` at the time when a skin is recorded."""
-        return self.cov if self.drift is None else self.cov + jnp.diag(self.drift_std() ** 2)
+        if self.drift is None:
+            return self.cov
+        cov, std = untraced((self.cov, self.drift_std()))
+        return cov + namespace(cov, std).diag(std**2)
 
     @property
     def r_known(self) -> Float[Array, ""]:
@@ -331,18 +334,19 @@ class ContinuousDriver(Driver):
         """Source impedance Z_th [Ω] in continuous time at real frequencies [Hz]."""
         return self.source.response(frequency)
 
-    @in_numpy
-    def log_response_stderr(self, frequency: Quantity) -> Float[Array, "2 ..."]:
+    @in_float64
+    @array_function
+    def log_response_stderr(self, frequency: Quantity) -> Float[AnyArray, "2 ..."]:
         """Standard errors of ln |Z_th| and of its phase [rad] at real frequencies [Hz].
 
         var = J cov Jᵀ,    J = ∂(ln |Z_th|, arg Z_th) / ∂parameters
         """
-        at = jnp.asarray(frequency, float)
-        z_th, slopes = self.source.with_slopes(at.ravel())
-        relative = slopes * reciprocal(z_th)[None, :]
-        parts = jnp.stack([relative.real, relative.imag])
-        variance = jnp.einsum("cif,ij,cjf->cf", parts, self.cov, parts)
-        return jnp.sqrt(variance).reshape(2, *at.shape)
+        at, cov = untraced((frequency, self.cov))
+        at = namespace(at).asarray(at, float)
+        z_th, slopes = self.source.with_slopes(at.reshape(-1))
+        xp, relative = namespace(z_th, cov), slopes * reciprocal(z_th)
+        parts = xp.stack([relative.real, relative.imag])
+        return xp.sqrt((parts * (cov @ parts)).sum(1)).reshape(2, *at.shape)
 
     def _numbers(self) -> str:
         if self.verdict == "resistors_disagree":

@@ -98,11 +98,11 @@ class Rational(Module):
     num: Float[AnyArray, " num"]
     den: Float[AnyArray, " den"]
 
-    def __call__(self, x: Inexact[Array, "..."]) -> Complex[Array, "..."]:
+    def __call__(self, x: Inexact[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Evaluate at `x`."""
-        x = as_complex(jnp.asarray(x))
-        num, den = as_complex(self.num), as_complex(self.den)
-        return jnp.polyval(num[::-1], x) * reciprocal(jnp.polyval(den[::-1], x))
+        xp = namespace(x, self.num, self.den)
+        x, num, den = (as_complex(xp.asarray(of)) for of in (x, self.num, self.den))
+        return xp.polyval(num[::-1], x) * reciprocal(xp.polyval(den[::-1], x))
 
     def add(self, other: "Rational") -> "Rational":
         """The sum `self + other`."""
@@ -172,10 +172,11 @@ def _by_row(xp: ModuleType, value: Any) -> Any:
 
 
 def delay_variable(
-    frequency: Float[Array, "..."], sample_rate: float | Float[Array, ""]
-) -> Complex[Array, "..."]:
+    frequency: Float[AnyArray, "..."], sample_rate: float | Float[AnyArray, ""]
+) -> Complex[AnyArray, "..."]:
     """The variable z⁻¹ = exp(−j 2π f / fs) at real frequencies [Hz]."""
-    return jnp.exp(-frequency_variable(frequency / sample_rate))
+    cycles = frequency / sample_rate
+    return namespace(cycles).exp(-frequency_variable(cycles))
 
 
 def poles(a: Float[AnyArray, " order1"]) -> Complex[AnyArray, " order"]:
