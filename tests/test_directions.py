@@ -19,7 +19,7 @@ from etid.circuits.directions import (
     scored,
     simulated,
 )
-from etid.likelihood.arrays import array_function
+from etid.precision import array_function
 from etid.simulation.transformer import TransformerDriver
 
 F = np.geomspace(60.0, 8e4, 40)

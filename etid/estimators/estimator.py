@@ -19,6 +19,7 @@ from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
+from etid.signals.transfer import AnyArray
 
 CHECKED = (
     "the records passed the checks for flat, clipped, missing and misplaced samples",
@@ -135,7 +136,7 @@ class AbstractEstimator(abc.ABC):
     def fit_driver(
         self,
         records: Any,
-        r_load: Float[Array, " record"],
+        r_load: Float[AnyArray, " record"],
         order: int,
         instrument: Instrument | None,
     ) -> Driver:

@@ -253,7 +253,7 @@ class Calibrations:
         by_delay = (-gains * frequency_variable(f / self.rate))[..., None, :, :]
         rows = [by_source, np.eye(f.shape[0])[:, :, None] * by_delay]
         rows += [] if by_error is None else [by_error]
-        return Slopes(z_th, gains, by_z, xp.concatenate(rows, -3))
+        return Slopes(z_th, gains, by_z, by_z, xp.concatenate(rows, -3))
 
     @array_function
     def near(self, common: Float[AnyArray, "*row common"]) -> Near:

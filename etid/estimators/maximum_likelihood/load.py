@@ -26,7 +26,7 @@ from etid.estimators.maximum_likelihood.gains import (
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, UnloadedEstimate
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests import falling_resistance
-from etid.likelihood.arrays import array_function
+from etid.precision import array_function
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import (
     as_complex,
