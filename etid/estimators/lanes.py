@@ -176,10 +176,15 @@ class Harmonics(AbstractLane):
         return cls(frequency, x, y, of_x, of_y, selected, m.sample_rate)
 
     @property
+    def fields(self) -> Spectrum:
+        """The harmonics without the sample rate."""
+        of = (self.frequency, self.x, self.y, self.variance_x, self.variance_y, self.selected)
+        return Spectrum(*of)
+
+    @property
     def spectrum(self) -> Spectrum:
-        """The harmonics without the sample rate, as arrays of JAX."""
-        fields = (self.frequency, self.x, self.y, self.variance_x, self.variance_y, self.selected)
-        return Spectrum(*map(jnp.asarray, fields))
+        """The same as arrays of JAX."""
+        return jax.tree.map(jnp.asarray, self.fields)
 
     def realigned(self, late: Lags) -> "Harmonics":
         """The lane with `v_out` advanced by whole samples: multiplied by e^(jω late / fs)."""

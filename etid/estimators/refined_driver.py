@@ -33,7 +33,7 @@ from etid.signals import modal
 from etid.signals.harmonics import Spectrum
 from etid.signals.knots import above_noise, banded
 from etid.signals.noise import Measurement
-from etid.signals.transfer import AnyArray, Rational
+from etid.signals.transfer import AnyArray, Rational, power
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
@@ -67,7 +67,7 @@ def from_harmonics(
 
     All harmonics are used of the bands in which V_th exceeds its noise.
     """
-    spectrum, r_load = jax.tree.map(np.asarray, (records.spectrum, r_load))
+    spectrum, r_load = jax.tree.map(np.asarray, (records.fields, r_load))
     rate = np.asarray(records.sample_rate)[0]
     bands = banded(spectrum)
     spectra = above_noise(spectrum, bands)
@@ -99,8 +99,10 @@ def from_harmonics(
         off = of_calibrations.mismatch(model, near, linear)
         calibration = dataclasses.replace(calibration, mismatch=off.off, across=off.across)
     chi2 = 2 * least.objective / (model.terms - model.unknowns)
-    rrse = complex_rrse(near.profiles[0].gains * spectra.x, spectra.y, spectra.selected).max()
-    squares = model.squares(near.profiles)
+    gains = near.profiles[0].gains  # of all calibrations; hum shows in harmonics that are not used
+    squares = power(spectra.y - gains * spectra.x)
+    squares = squares / (spectra.variance_y + power(gains) * spectra.variance_x)
+    rrse = complex_rrse(gains * spectra.x, spectra.y, spectra.selected).max()
     hum = shows_hum(squares, spectra.frequency[0], spectra.selected)
     passive = _is_passive(model.source, cov, rate)
     faults = _faults(chi2, rrse, least.settled, calibration, passive, model.terms, statistic)

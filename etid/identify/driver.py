@@ -264,7 +264,7 @@ def with_harmonics(driver: ContinuousDriver, calibrations: Sequence[Recording]) 
 
 def _clear(records: Harmonics) -> Spectrum:
     """The harmonics that a driver is refined with."""
-    spectrum = jax.tree.map(np.asarray, records.spectrum)
+    spectrum = jax.tree.map(np.asarray, records.fields)
     return jax.device_put(above_noise(spectrum, banded(spectrum)))
 
 

@@ -126,7 +126,7 @@ def delay_width(
     delay = None if instrument is None else instrument.delay
     xp = namespace(sample_rate, *([] if delay is None else [delay]))
     if delay is None:
-        return xp.asarray(DELAY_WIDTH)
+        return DELAY_WIDTH
     return xp.minimum(delay * sample_rate, DELAY_WIDTH)
 
 

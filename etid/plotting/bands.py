@@ -164,7 +164,7 @@ def fitted(
         size, vectors = np.linalg.eigh(cov)
         changes = (vectors * np.sqrt(np.maximum(size, 0.0))).T @ slopes
     instrument = None if isinstance(feed, MeasuredCurrent) else feed.instrument
-    width = np.asarray(delay_width(instrument, jax.device_put(np.asarray(lane.sample_rate))))
+    width = np.asarray(delay_width(instrument, np.asarray(lane.sample_rate)))
     deviations, start = np.append(width, np.ones(len(changes))), np.zeros(1 + len(changes))
 
     def at(p: Float[np.ndarray, " parameter"]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:

@@ -140,11 +140,11 @@ class GivenDriver(Module):
     gains: Complex[AnyArray, "calibration known"] | None
     gain_slopes: Complex[AnyArray, "z calibration known"] | None
     shape: UnloadedShape | None = None
-    delay_width: Float[AnyArray, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
+    delay_width: Float[AnyArray, ""] = eqx.field(default_factory=lambda: np.asarray(DELAY_WIDTH))
     faults: tuple[Float[AnyArray, "3"], Float[AnyArray, "z 3"]] | None = None
     errors: InstrumentErrors | None = None
     bend: Complex[AnyArray, " harmonic"] | None = None
-    aside: Float[AnyArray, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    aside: Float[AnyArray, ""] = eqx.field(default_factory=lambda: np.zeros(()))
     by_current: bool = eqx.field(static=True, default=False)
 
     @classmethod
