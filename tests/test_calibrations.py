@@ -13,6 +13,7 @@ from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.driver import brought_near, minimum
 from etid.likelihood.linear import LevenbergMarquardt
 from etid.likelihood.source_prior import SourcePrior
+from etid.results.driver import HarmonicDriver
 from etid.signals import modal
 from etid.signals.knots import banded
 from etid.simulation.scenes import Scene, Trial
@@ -26,6 +27,7 @@ def model():
     """One calibration at 50 dB, of NumPy, with the driver that etid identifies."""
     study = etid.scenes.paper_dry(snr_db=50.0).simulate(seed=3)
     driver = etid.identify_driver(study["calibration/98k8"])
+    assert isinstance(driver, HarmonicDriver)
     return jax.tree.map(np.asarray, Calibrations.of(driver))
 
 
@@ -125,6 +127,7 @@ def test_calibrations_of_one_unloaded_record_are_outputs_of_one_input():
     trials = tuple(Trial(path, ResistorLoad(r)) for path, r in known.items())
     records = Scene(trials, snr_db=60.0, shared_v_th=True).simulate(seed=1).recordings()
     driver = etid.identify_driver([one.replace(r_load=known[one.path]) for one in records])
+    assert isinstance(driver, HarmonicDriver)
     of = jax.tree.map(np.asarray, Calibrations.of(driver))
     (record,) = of.records()
     assert record.used.any(-1).tolist() == [True, True]
