@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
 SAMPLES = 10_000
 SIGMAS = 5.0  # one in 2 million for a normal error
-FILES = 48  # that a reader of `identify_skin` opens at most, inspection and verdict included
+FILES = 53  # that a reader of `identify_skin` opens at most, inspection and verdict included
 
 
 def simulate(trials=1, resistors=(98.8e3,), samples=SAMPLES, seed=0, **options):

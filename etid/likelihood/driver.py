@@ -38,7 +38,7 @@ from etid.signals.harmonics import Spectrum, real_parts
 from etid.signals.transfer import AnyArray, as_complex, power
 
 ROUGHLY = 0.2  # [standard errors] length of the last steps with bands
-ROUGH_STEPS = 60  # with bands; more of them spare the search at the knots no steps
+ROUGH_STEPS = 60  # with bands; with half of them a driver takes twice as long, with more as long
 PATIENCE = 3  # short steps that end a search: a step after a rejected one is short, too
 MAX_STEPS = 500  # at the knots of one point
 

@@ -21,7 +21,7 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, impedance_at, with_slopes
 from etid.circuits.directions import DIRECTIONS, ON_LOADS, At, Direction
-from etid.likelihood.arrays import along_outputs
+from etid.likelihood.profile import along_outputs
 from etid.likelihood.source import Source
 from etid.precision import namespace
 from etid.signals.transfer import AnyArray, as_complex, frequency_variable, reciprocal, turns

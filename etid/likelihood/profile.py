@@ -33,7 +33,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Inexact
 
-from etid.likelihood.arrays import along_outputs
 from etid.precision import array_function, namespace
 from etid.signals.harmonics import real_parts
 from etid.signals.knots import Knots
@@ -247,3 +246,10 @@ class Condensed(NamedTuple):
 def added(values: Sequence[AnyArray]) -> AnyArray:
     """The sum of arrays, such as those of each input."""
     return functools.reduce(operator.add, values)
+
+
+def along_outputs(
+    each: Sequence[Inexact[AnyArray, "*row bin"]],
+) -> Inexact[AnyArray, "*row output bin"]:
+    """Values of each output along an axis of outputs; without a copy if there is one output."""
+    return each[0][..., None, :] if len(each) == 1 else namespace(each[0]).stack(each, -2)
