@@ -93,7 +93,7 @@ def problem_of(study: etid.Study, driver: etid.Driver) -> Problem:
     """The same for given recordings."""
     records = list(study.loaded.recordings())
     lanes = [harmonics(record) for record in records]
-    known = known_of(lanes[0], driver, False, MAXIMUM_LIKELIHOOD)
+    known = jax.device_put(known_of(lanes[0], driver, False, MAXIMUM_LIKELIHOOD))
     assert isinstance(known, GivenDriver)
     return Problem(study, driver, records, stacked(lanes), known)
 

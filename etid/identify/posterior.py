@@ -283,7 +283,7 @@ def given(
     lane = lane.realigned(late)
     if int(fit.remarks) & Remark.mains_hum:
         lane = lane.without_mains() or lane
-    known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
+    known = jax.device_put(known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD))
     elements = ElementPrior.of(estimator.known_elements, fit.circuit)
     if estimator.bounds:  # the draws begin with those of the same fit without bounds
         unbounded = dataclasses.replace(estimator, bounds=())
