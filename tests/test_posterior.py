@@ -119,7 +119,7 @@ def test_at_20_db_intervals_contain_the_truth_of_posterior_and_profile(kind):
             ends = [*fit.posterior().intervals().values(), fit.profile("r_s").interval()]
             low, high = np.array(ends).T
             covered.append((low < truth) & (truth < high))
-    assert len(covered) > 30
+    assert len(covered) >= 30
     # Of 30 intervals of 95 %, less than 24 contain the truth in one of 4 000 tests. In 60
     # studies of dry skin the posterior has 84 % of R_s and 90 % of the others, the profile 93 %.
     assert (np.mean(covered, axis=0) >= 0.8).all(), np.mean(covered, axis=0)
