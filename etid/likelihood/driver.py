@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from etid.likelihood.calibrations import Calibrations, Near
+from etid.likelihood.gains import Slopes
 from etid.likelihood.linear import (
     LevenbergMarquardt,
     NormalEquations,
@@ -24,15 +25,7 @@ from etid.likelihood.linear import (
     replaced,
     taken,
 )
-from etid.likelihood.search import (
-    BEFORE,
-    IDLE,
-    NO_BETTER,
-    POINTS,
-    ROUNDING,
-    WELL,
-    select,
-)
+from etid.likelihood.search import BEFORE, POINTS, WELL, decided, select
 from etid.precision import array_function, namespace
 from etid.signals.harmonics import Spectrum, real_parts
 from etid.signals.transfer import AnyArray, as_complex, power
@@ -80,8 +73,11 @@ class _Knots:
         return namespace(q).concatenate([at, self.model.weak(q)[0]], -1)
 
     def equations(self, q: Float[AnyArray, "*row q"]) -> NormalEquations:
-        xp, condensed = namespace(q), self.near.condensed
-        slopes, (weak, by_weak) = self.model.slopes(q, self.model.knots), self.model.weak(q)
+        return self.at(q, self.model.slopes(q, self.model.knots))
+
+    def at(self, q: Float[AnyArray, "*row q"], slopes: Slopes) -> NormalEquations:
+        """The normal equations where the slopes are known."""
+        xp, condensed, (weak, by_weak) = namespace(q), self.near.condensed, self.model.weak(q)
         at = xp.concatenate([condensed.terms(slopes.gains), weak], -1)
         rows = xp.concatenate([condensed.rows(slopes.by_q), by_weak], -1)
         return NormalEquations.of(at, rows)
@@ -148,7 +144,7 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
     def followed(near: Near, unit: Float[AnyArray, "*row"]) -> tuple[AnyArray, ...]:
         """The minimum at the knots, what it promises, and the curvature there."""
         problem = _Knots(model, near)
-        first, enough = problem.equations(near.q), (WELL * BEFORE) ** 2 * unit
+        first, enough = problem.at(near.q, near.slopes), (WELL * BEFORE) ** 2 * unit
         found = LevenbergMarquardt(1e-6, MAX_STEPS, PATIENCE, True)(problem, near.q, first, enough)
         # A fit that did not settle promises everything: it is at no minimum.
         left = xp.where(found.moves, -np.inf, found.equations.objective)
@@ -159,17 +155,11 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
     ) -> _State:
         idle, points = state
         unit = objective / model.terms
-        target, promised, matrix = followed(near, unit)
-        stays = ~better & (promised <= NO_BETTER**2 * unit)
-        target = xp.where(stays[..., None], near.q, target)
-        promised = xp.where(stays, 0.0, promised)
-        idles = xp.maximum(xp.abs(reduced), promised) <= ROUNDING * objective
-        idle = xp.where(idles, idle + 1, 0)
-        trial = xp.where(better[..., None], target, 0.5 * (target + near.q))
-        trial = xp.where(xp.isfinite(trial).all(-1)[..., None], trial, near.q)
-        settled = (promised <= BEFORE**2 * unit) | (idle >= IDLE)
-        moves = ~settled & xp.isfinite(objective)
-        return _State(near, objective, matrix, target, trial, settled, idle, points + 1, moves)
+        *found, matrix = followed(near, unit)
+        to = decided(near.q, objective, unit, (found[0], found[1]), better, reduced, idle)
+        moves, points = ~to.settled & xp.isfinite(objective), points + 1
+        at = near, objective, matrix
+        return _State(*at, to.target, to.trial, to.settled, to.idle, points, moves)
 
     def step(state: _State) -> _State:
         if xp is np and start.ndim > 1 and not state.moves.all():

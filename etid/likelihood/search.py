@@ -337,15 +337,59 @@ def _next(
     if xp is not np or goes.any():
         target, left = _followed(load, at_knots, near, here, target, goes, promised)
         promised = xp.where(goes, here.objective - left, promised)
+    going = decided(best, near.objective, scale, (target, promised), better, reduced, idle)
+    trial, target, promised, settled, idle = going
+    return _State(trial, near, target, promised, settled, idle, xp.ones_like(idle))
+
+
+class Decision(NamedTuple):
+    """Where a search by successive approximations goes.
+
+    Attributes:
+        trial: The next point.
+        target: The minimum of the approximation near the best point.
+        promised: Reduction of ½ Σ r² by the step to it.
+        settled: Whether it is the minimum.
+        idle: Points in a row that have brought nothing.
+    """
+
+    trial: Float[AnyArray, "*row q"]
+    target: Float[AnyArray, "*row q"]
+    promised: Float[AnyArray, "*row"]
+    settled: Bool[AnyArray, "*row"]
+    idle: Int[AnyArray, "*row"]
+
+
+def decided(
+    best: Float[AnyArray, "*row q"],
+    objective: Float[AnyArray, "*row"],
+    scale: Float[AnyArray, "*row"],
+    found: tuple[Float[AnyArray, "*row q"], Float[AnyArray, "*row"]],
+    better: Bool[AnyArray, "*row"],
+    reduced: Float[AnyArray, "*row"],
+    idle: Int[AnyArray, "*row"],
+) -> Decision:
+    """The next point, and whether the search ends.
+
+    Args:
+        best: The best point.
+        objective: ½ Σ r² there.
+        scale: The same for each term.
+        found: The minimum of the approximation near the best point, and what it promises.
+        better: Whether the last point is the best.
+        reduced: By how much it is better.
+        idle: Points in a row before it that have brought nothing.
+    """
+    xp, (target, promised) = namespace(best), found
     stays = ~better & (promised <= NO_BETTER**2 * scale)
     target = xp.where(stays[..., None], best, target)
     promised = xp.where(stays, 0.0, promised)
-    idles = xp.maximum(xp.abs(reduced), promised) <= ROUNDING * near.objective
+    idles = xp.maximum(xp.abs(reduced), promised) <= ROUNDING * objective
     idle = xp.where(idles, idle + 1, 0)
     trial = xp.where(better[..., None], target, 0.5 * (target + best))
     trial = xp.where(xp.isfinite(trial).all(-1)[..., None], trial, best)
     settled = (promised <= BEFORE**2 * scale) | (idle >= IDLE)
-    return _State(trial, near, target, promised, settled, idle, xp.ones_like(idle))
+    return Decision(trial, target, promised, settled, idle)
 
 
 def _followed(
