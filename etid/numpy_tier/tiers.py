@@ -124,23 +124,6 @@ def program(
     return call
 
 
-def in_numpy(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """A `program` for a user's arrays: outside of a trace they become arrays of NumPy.
-
-    An array of JAX in float64 falls to float32 in the first operation of a process that has not set
-    `jax_enable_x64`.
-    """
-    run = program(function)
-
-    @functools.wraps(function)
-    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        found = run(*args, **kwargs)
-        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(found))
-        return found if traced else jax.device_get(found)
-
-    return call
-
-
 def _known(options: dict[str, Any]) -> dict[str, Any]:
     """Those of the options that this version of XLA has; others would end the compilation."""
     return {name: value for name, value in options.items() if _is_known(name, value)}

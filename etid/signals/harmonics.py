@@ -75,11 +75,6 @@ def same_unloaded(
     return power(one - other).sum() <= ROUNDING**2 * power(other).sum()
 
 
-def as_list(spectra: Spectrum) -> list[Spectrum]:
-    """A list of recordings, from recordings stacked along a leading axis."""
-    return [jax.tree.map(lambda leaf, i=i: leaf[i], spectra) for i in range(spectra.x.shape[0])]
-
-
 def whole_periods(samples: int, sample_rate: float, pulse_rate: float) -> tuple[int, int]:
     """Number of whole periods in a record, and their length in samples.
 

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.likelihood.noise import HUM, LOW, SURE
 from etid.results.fit import complex_rrse
-from etid.signals.harmonics import Spectrum, local_sum, real_parts, signal_share
+from etid.signals.harmonics import Spectrum, local_sum, real_parts
 from etid.signals.mains import lines
 from etid.signals.transfer import as_complex, power
 
@@ -149,11 +149,6 @@ class Profile(eqx.Module):
     def size(self) -> Float[Array, "output harmonic"]:
         """Information of each innovation about its gain."""
         return self.weight * power(self.x)[None, :]
-
-    @property
-    def share(self) -> Float[Array, " harmonic"]:
-        """Share of signal in the power of X̂."""
-        return signal_share(self.x, self.variance_x)
 
     @property
     def terms(self) -> Float[Array, "output part"]:
