@@ -15,9 +15,9 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import Gains
-from etid.likelihood.linear import LevenbergMarquardt, NormalEquations
+from etid.likelihood.linear import DIFFERENCE, LevenbergMarquardt, NormalEquations, bend
 from etid.likelihood.profile import Profile, Records
-from etid.likelihood.search import Near, minimum
+from etid.likelihood.search import Near, decided, minimum
 from etid.likelihood.starts import starts
 from etid.precision import array_function
 from etid.recordings.preflight import Inspected
@@ -175,6 +175,9 @@ class Valley:
         rows = np.stack([np.stack([-20 * x, -one], -1), np.stack([10 * one, 0 * x], -1)], -2)
         return NormalEquations.of(self.terms(q), rows)
 
+    def bend(self, q, at, move):
+        return bend(at, self.terms(q + DIFFERENCE * move), move)
+
     def of(self, rows):
         del rows
         return self
@@ -194,6 +197,18 @@ def test_levenberg_marquardt_finds_the_minimum_of_each_row(curved):
             alone = search(valley, start, valley.equations(start), np.array([1e-24]))
             np.testing.assert_allclose(alone.q[0], found.q[number], atol=1e-12)
             assert alone.steps[0] == found.steps[number]
+
+
+def test_a_point_that_is_no_better_is_replaced_by_the_middle_between_it_and_the_best():
+    """So that points that fail one after another come nearer."""
+    best, one, no = np.zeros((1, 2)), np.ones(1), np.array([False])
+    trial, promised = np.full((1, 2), 8.0), np.array([4.0])
+    for side in (4.0, 2.0, 1.0):
+        found = (np.full((1, 2), 8.0), promised)
+        decision = decided(best, 100 * one, one, found, trial, no, -one, np.zeros(1, int))
+        trial = decision.trial
+        np.testing.assert_array_equal(trial, np.full((1, 2), side))
+        assert not decision.settled[0]
 
 
 def test_two_outputs_condense_to_the_exact_normal_equations():

@@ -19,8 +19,10 @@ from jaxtyping import Bool, Float, Int
 from etid.likelihood.calibrations import Calibrations, Near
 from etid.likelihood.gains import Slopes
 from etid.likelihood.linear import (
+    DIFFERENCE,
     LevenbergMarquardt,
     NormalEquations,
+    bend,
     repeated,
     replaced,
     taken,
@@ -62,18 +64,23 @@ class _Bands:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Knots:
-    """Condensed terms near a point."""
+class AtKnots:
+    """Condensed terms near a point, as `linear.Curved`."""
 
     model: Calibrations
     near: Near
 
-    def terms(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row term"]:
-        at = self.near.condensed.terms(self.model.gains(q, self.model.knots))
-        return namespace(q).concatenate([at, self.model.weak(q)[0]], -1)
-
     def equations(self, q: Float[AnyArray, "*row q"]) -> NormalEquations:
+        """The normal equations at a point."""
         return self.at(q, self.model.slopes(q, self.model.knots))
+
+    def bend(
+        self, q: Float[AnyArray, "*row q"], at: NormalEquations, move: Float[AnyArray, "*row q"]
+    ) -> Float[AnyArray, "*row q"]:
+        """Jᵀ r″ of a step from a point."""
+        q = q + DIFFERENCE * move
+        ahead = self.near.condensed.terms(self.model.gains(q, self.model.knots))
+        return bend(at, namespace(q).concatenate([ahead, self.model.weak(q)[0]], -1), move)
 
     def at(self, q: Float[AnyArray, "*row q"], slopes: Slopes) -> NormalEquations:
         """The normal equations where the slopes are known."""
@@ -82,8 +89,9 @@ class _Knots:
         rows = xp.concatenate([condensed.rows(slopes.by_q), by_weak], -1)
         return NormalEquations.of(at, rows)
 
-    def of(self, rows: np.ndarray) -> "_Knots":
-        return _Knots(self.model, taken(self.near, rows))
+    def of(self, rows: np.ndarray) -> "AtKnots":
+        """Some of the rows."""
+        return AtKnots(self.model, taken(self.near, rows))
 
 
 @array_function
@@ -143,7 +151,7 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
 
     def followed(near: Near, unit: Float[AnyArray, "*row"]) -> tuple[AnyArray, ...]:
         """The minimum at the knots, what it promises, and the curvature there."""
-        problem = _Knots(model, near)
+        problem = AtKnots(model, near)
         first, enough = problem.at(near.q, near.slopes), (WELL * BEFORE) ** 2 * unit
         found = LevenbergMarquardt(1e-6, MAX_STEPS, PATIENCE, True)(problem, near.q, first, enough)
         # A fit that did not settle promises everything: it is at no minimum.
@@ -151,12 +159,18 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
         return found.q, first.objective - left, found.equations.matrix
 
     def going(
-        near: Near, objective: AnyArray, better: AnyArray, reduced: AnyArray, state: AnyArray
+        near: Near,
+        objective: AnyArray,
+        last: AnyArray,
+        better: AnyArray,
+        reduced: AnyArray,
+        counts: tuple[AnyArray, AnyArray],
     ) -> _State:
-        idle, points = state
+        idle, points = counts
         unit = objective / model.terms
         *found, matrix = followed(near, unit)
-        to = decided(near.q, objective, unit, (found[0], found[1]), better, reduced, idle)
+        of = (found[0], found[1]), last, better, reduced, idle
+        to = decided(near.q, objective, unit, *of)
         moves, points = ~to.settled & xp.isfinite(objective), points + 1
         at = near, objective, matrix
         return _State(*at, to.target, to.trial, to.settled, to.idle, points, moves)
@@ -169,13 +183,13 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
         reduced = state.objective - objective
         better = reduced >= 0
         kept = select(better, (near, objective), (state.near, state.objective))
-        found = going(*kept, better, reduced, (state.idle, state.points))
+        found = going(*kept, state.trial, better, reduced, (state.idle, state.points))
         return select(state.moves, found, state)
 
     near, objective = evaluated(start)
     none = xp.zeros(objective.shape, int)
     better = xp.isfinite(objective)
-    first = going(near, objective, better, xp.zeros_like(objective), (none, none))
+    first = going(near, objective, start, better, xp.zeros_like(objective), (none, none))
     last = repeated(step, first, POINTS - 1)
     q = xp.where(last.settled[..., None], last.target, last.near.q)
     return Minimum(q, last.objective, last.matrix, last.settled, last.points)

@@ -114,8 +114,13 @@ class Problem(Protocol):
 class Curved(Problem, Protocol):
     """Terms whose curvature steps can follow."""
 
-    def terms(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row term"]:
-        """The terms at a point."""
+    def bend(
+        self,
+        q: Float[AnyArray, "*row q"],
+        at: NormalEquations,
+        move: Float[AnyArray, "*row q"],
+    ) -> Float[AnyArray, "*row q"]:
+        """Jᵀ r″ of a step from a point, where the normal equations are known."""
         ...
 
 
@@ -199,7 +204,7 @@ class LevenbergMarquardt:
         move = at.step(state.damping, scale)
         ends = state.idle + (at.promised(move) <= state.enough) >= self.patience
         if self.curved:
-            bent = at._replace(gradient=_bend(cast("Curved", problem), state.q, at, move))
+            bent = at._replace(gradient=cast("Curved", problem).bend(state.q, at, move))
             turned = 0.5 * bent.step(state.damping, scale)
             sizes = [xp.sqrt(((one * scale) ** 2).sum(-1)) for one in (turned, move)]
             small = 4 * sizes[0] <= ACCELERATION * sizes[1]
@@ -224,16 +229,14 @@ class LevenbergMarquardt:
         return self._proposed(problem, found._replace(equations=NormalEquations(*kept)))
 
 
-def _bend(
-    problem: Curved,
-    q: Float[AnyArray, "*row q"],
+def bend(
     at: NormalEquations,
+    ahead: Float[AnyArray, "*row term"],
     move: Float[AnyArray, "*row q"],
 ) -> Float[AnyArray, "*row q"]:
-    """Jᵀ r″ along a step."""
+    """Jᵀ r″ of a step, from the terms `DIFFERENCE` of it ahead of the point."""
     assert at.rows is not None
     slope = (at.rows * move[..., :, None]).sum(-2)
-    ahead = problem.terms(q + DIFFERENCE * move)
     bent = 2 / DIFFERENCE * ((ahead - at.terms) / DIFFERENCE - slope)
     return (at.rows @ bent[..., None])[..., 0]
 

@@ -25,7 +25,7 @@ from etid.likelihood.linear import (
 from etid.likelihood.profile import Condensed, Profile, Records
 from etid.likelihood.shared import Unloaded
 from etid.precision import array_function, namespace
-from etid.signals.knots import Knots, knots
+from etid.signals.knots import DENSITY, Knots, knots
 from etid.signals.transfer import AnyArray, as_complex, reciprocal
 
 POINTS = 100  # largest number of points; below 24 dB some fits take dozens
@@ -53,6 +53,7 @@ class Load:
         centre: Prior means of the parameters.
         width: Prior standard deviations of the parameters; infinite without a prior.
         unloaded: X that the calibrations estimate; None if the recordings share none with them.
+        density: Of the knots (`etid.signals.knots.knots`).
     """
 
     gains: Gains
@@ -60,17 +61,18 @@ class Load:
     centre: Float[AnyArray, " q"]
     width: Float[AnyArray, " q"]
     unloaded: Unloaded | None = None
+    density: int = DENSITY
 
     @property
     def knots(self) -> Knots:
         """Knots of the harmonics."""
-        return knots(self.records.x.shape[-1])
+        return knots(self.records.x.shape[-1], self.density)
 
     def of(self, rows: np.ndarray) -> "Load":
         """Some of the rows."""
         unloaded = self.unloaded and self.unloaded.of(rows)
-        of = self.gains.of(rows), self.records.of(rows)
-        return Load(*of, self.centre, self.width, unloaded)
+        gains, records = self.gains.of(rows), self.records.of(rows)
+        return dataclasses.replace(self, gains=gains, records=records, unloaded=unloaded)
 
     def known(self, q: Float[AnyArray, "*row q"]) -> Records:
         """The records with the X that the calibrations estimate."""
@@ -256,14 +258,14 @@ def minimum(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 
         near = Near.of(load, at_knots, near.q + shift)
     xp, none = namespace(starts), np.zeros(starts.shape[1:-1], int)
     better = xp.isfinite(near.objective)
-    state = _next(load, at_knots, near, better, xp.zeros_like(near.objective), none)
+    state = _next(load, at_knots, near, near.q, better, xp.zeros_like(near.objective), none)
 
     def step(load: Load, at_knots: Gains, state: _State) -> _State:
         near = Near.of(load, at_knots, state.trial)
         reduced = state.near.objective - near.objective
         better = reduced >= 0
         kept = select(better, near, state.near)
-        found = _next(load, at_knots, kept, better, reduced, state.idle)
+        found = _next(load, at_knots, kept, state.trial, better, reduced, state.idle)
         return found._replace(points=state.points + 1)
 
     def goes_on(state: _State) -> Bool[AnyArray, "*row"]:
@@ -322,6 +324,7 @@ def _next(
     load: Load,
     at_knots: Gains,
     near: Near,
+    last: Float[AnyArray, "*row q"],
     better: Bool[AnyArray, "*row"],
     reduced: Float[AnyArray, "*row"],
     idle: Int[AnyArray, "*row"],
@@ -337,7 +340,8 @@ def _next(
     if xp is not np or goes.any():
         target, left = _followed(load, at_knots, near, here, target, goes, promised)
         promised = xp.where(goes, here.objective - left, promised)
-    going = decided(best, near.objective, scale, (target, promised), better, reduced, idle)
+    found = target, promised
+    going = decided(best, near.objective, scale, found, last, better, reduced, idle)
     trial, target, promised, settled, idle = going
     return _State(trial, near, target, promised, settled, idle, xp.ones_like(idle))
 
@@ -365,6 +369,7 @@ def decided(
     objective: Float[AnyArray, "*row"],
     scale: Float[AnyArray, "*row"],
     found: tuple[Float[AnyArray, "*row q"], Float[AnyArray, "*row"]],
+    last: Float[AnyArray, "*row q"],
     better: Bool[AnyArray, "*row"],
     reduced: Float[AnyArray, "*row"],
     idle: Int[AnyArray, "*row"],
@@ -376,7 +381,8 @@ def decided(
         objective: ½ Σ r² there.
         scale: The same for each term.
         found: The minimum of the approximation near the best point, and what it promises.
-        better: Whether the last point is the best.
+        last: The last point.
+        better: Whether it is the best.
         reduced: By how much it is better.
         idle: Points in a row before it that have brought nothing.
     """
@@ -386,7 +392,7 @@ def decided(
     promised = xp.where(stays, 0.0, promised)
     idles = xp.maximum(xp.abs(reduced), promised) <= ROUNDING * objective
     idle = xp.where(idles, idle + 1, 0)
-    trial = xp.where(better[..., None], target, 0.5 * (target + best))
+    trial = xp.where(better[..., None], target, 0.5 * (last + best))
     trial = xp.where(xp.isfinite(trial).all(-1)[..., None], trial, best)
     settled = (promised <= BEFORE**2 * scale) | (idle >= IDLE)
     return Decision(trial, target, promised, settled, idle)

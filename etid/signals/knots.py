@@ -30,6 +30,8 @@ from etid.precision import array_function, namespace
 from etid.signals.harmonics import ABSENT, Spectrum
 from etid.signals.transfer import AnyArray, as_complex, from_parts, power
 
+DENSITY = 16  # smallest number of a harmonic over the distance of the knots around it
+
 
 @dataclasses.dataclass(frozen=True)
 class _Group:
@@ -110,7 +112,7 @@ def _product(
 
 
 @functools.lru_cache(maxsize=16)
-def knots(harmonics: int, relative: int = 16) -> Knots:
+def knots(harmonics: int, relative: int = DENSITY) -> Knots:
     """Knots of so many harmonics, the first of which is the pulse rate.
 
     Args:
