@@ -4,111 +4,113 @@ F is that of `etid.identify.posterior`. Its deviance is drawn over the stretched
 draws are there. Bounds are walls: no element leaves them.
 """
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
+import dataclasses
+
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import FIXED, require_element
-from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood.load import Load
-from etid.identify.posterior import Known, Minimum, cost, given
-from etid.numpy_tier.tiers import program
-from etid.precision import in_float64
+from etid.identify.posterior import Known, Minimum, costs, given
+from etid.likelihood.linear import LevenbergMarquardt, NormalEquations
+from etid.likelihood.search import Anew
+from etid.numpy_tier.algebra import one_thread
+from etid.precision import array_function, in_float64
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.results.posterior import Profile
-from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
+
+POINTS = 29  # of a profile
+FARTHEST = 3.5  # [standard errors]
+WALL = 1e3  # slope of the terms outside of bounds [1/standard error]
+ENOUGH = 1e-4  # of F, below which a step ends a search; the interval of 95 % is at 1.92
 
 
-class _Walls(eqx.Module):
-    """Bounds of the logarithms of the elements, as steep residuals outside.
+@dataclasses.dataclass(frozen=True)
+class _Inside:
+    """The likelihood of rows, with bounds as walls: steep terms outside.
 
     Attributes:
-        low: Lower bounds; −∞ without one.
+        terms: The likelihood.
+        free: Parameters that are not held.
+        low: Lower bounds of all parameters; −∞ without one.
         high: Upper bounds; ∞ without one.
-        error: Standard errors of the elements.
+        slope: Slopes of the walls.
     """
 
-    low: Float[Array, " element"]
-    high: Float[Array, " element"]
-    error: Float[Array, " element"]
+    terms: Anew
+    free: Bool[np.ndarray, "row q"]
+    low: Float[np.ndarray, " q"]
+    high: Float[np.ndarray, " q"]
+    slope: Float[np.ndarray, " q"]
 
-    def __call__(self, q: Float[Array, " q"]) -> Float[Array, " element"]:
-        """Distances outside, in thousandths of a standard error."""
-        own = q[: self.low.size]
-        outside = jnp.maximum(self.low - own, 0.0) + jnp.maximum(own - self.high, 0.0)
-        return 1e3 * outside / self.error
+    def equations(self, q: Float[np.ndarray, "row q"]) -> NormalEquations:
+        """The normal equations."""
+        found, free = self.terms.equations(q), self.free
+        outside = self.slope * (q - np.clip(q, self.low, self.high))
+        # At a wall, a step that leads out meets it.
+        leads = (q <= self.low) & (found.gradient > 0) | (q >= self.high) & (found.gradient < 0)
+        steep = np.where(leads | (outside != 0), self.slope, 0.0)
+        matrix = found.matrix * (free[:, :, None] & free[:, None, :])
+        own = np.where(free, steep**2, 1.0)[:, :, None] * np.eye(q.shape[-1])
+        return found._replace(
+            objective=found.objective + 0.5 * (outside**2).sum(-1),
+            gradient=(found.gradient + steep * outside) * free,
+            matrix=matrix + own,
+        )
 
-
-def _least(
-    terms: Load, walls: _Walls, start: Float[Array, " q"], free: Float[Array, "q free"]
-) -> Float[Array, " q"]:
-    """The minimum of F among `start` + `free` @ r, inside the walls."""
-
-    def residual(r: Float[Array, " free"], _) -> Float[Array, " term"]:
-        q = start + free @ r
-        return jnp.concatenate([terms(q), walls(q)])
-
-    def equations(_, r: Float[Array, " free"], __) -> NormalEquations:
-        value, jacobian = residual(r, None), jax.jacfwd(residual)(r, None)
-        return NormalEquations.of(value, jacobian.T)
-
-    solver = LevenbergMarquardt(rtol=1e-6, ftol=1e-8, equations=equations)
-    begin = jnp.zeros(free.shape[1])
-    found = optx.least_squares(residual, solver, begin, max_steps=200, throw=False)
-    return start + free @ found.value
+    def of(self, rows: np.ndarray) -> "_Inside":
+        """Some of the rows."""
+        return dataclasses.replace(self, terms=self.terms.of(rows), free=self.free[rows])
 
 
-@program
+@array_function
 def _profile(
-    lane: Harmonics,
+    least: Minimum,
     known: Known,
     circuit: AbstractCircuit,
-    number: Int[Array, ""],
-    stretched: Float[Array, " element"],
-) -> tuple[Float[Array, " point"], Float[Array, " point"]]:
+    number: int,
+    stretched: Float[np.ndarray, " element"],
+) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:
     """Logarithms of an element, and the deviance there.
 
     Args:
-        lane: Harmonics of the recording.
-        known: What is known besides.
+        least: The minimum without bounds.
+        known: What is known besides the recording.
         circuit: The fitted circuit.
         number: Number of the element.
         stretched: Standard errors of the logarithms of the elements, from the fit.
     """
-    least = Minimum.of(lane, known, circuit)
-    size, count = least.q.size, stretched.size
-    errors = jnp.sqrt(jnp.diagonal(least.cov))[:count]
-    names, limits = circuit.names(), np.tile([-np.inf, np.inf], (count, 1))
-    for name, low, high in known.bounds:
-        limits[names.index(name)] = np.log(low) if low > 0 else -np.inf, np.log(high)
-    own = least.q[:count]
-    low, high = ((jnp.asarray(end) - own) / stretched for end in limits.T)  # from the minimum
-    walls = _Walls(own + low * errors, own + high * errors, errors)
-    middle = jnp.clip(0.0, low[number], high[number])
-    ends = jnp.clip(middle + np.array([-3.5, 3.5]), low[number], high[number])  # [standard errors]
-    steps = jnp.linspace(ends[0], ends[1], 29)
-    others = jnp.where(jnp.arange(size - 1) < number, jnp.arange(size - 1), jnp.arange(1, size))
-    free = jnp.eye(size)[:, others]
-    towards = least.cov[:, number] / errors[number]
-
-    def deviance(step: Float[Array, ""]) -> Float[Array, ""]:
-        found = _least(least.terms, walls, least.q + towards * step, free)
-        return 2 * cost(least.terms, found)
-
-    best = least.q
-    if known.bounds:
-        best = _least(least.terms, walls, least.q + towards * middle, jnp.eye(size))
-    found = jax.lax.map(deviance, steps)
-    return least.q[number] + stretched[number] * steps, found - 2 * cost(least.terms, best)
+    load, q, cov = least
+    names, errors = circuit.names(), np.sqrt(np.diagonal(cov))
+    low, high = np.full(q.size, -np.inf), np.full(q.size, np.inf)  # [standard errors] from q
+    for name, *ends in known.bounds:
+        place = names.index(name)
+        low[place], high[place] = (np.log(ends) - q[place]) / stretched[place]
+    middle = np.clip(0.0, low[number], high[number])
+    first, last = np.clip([middle - FARTHEST, middle + FARTHEST], low[number], high[number])
+    steps = np.linspace(first, last, POINTS)
+    # Each value of the element is a row that holds it; in the last row it is free.
+    starts = q + np.append(steps, middle)[:, None] * cov[number] / errors[number]
+    free = np.ones(starts.shape, bool)
+    free[:-1, number] = False
+    rows = load.of(np.zeros(len(starts), int))
+    problem = _Inside(
+        Anew(rows, rows.gains.at(rows.knots.index)),
+        free,
+        q + low * errors,
+        q + high * errors,
+        WALL / errors,
+    )
+    search = LevenbergMarquardt(damping=1e-2, steps=200)
+    found = search(problem, starts, problem.equations(starts), ENOUGH).q
+    deviance = 2 * costs(load, found)
+    return q[number] + stretched[number] * steps, deviance[:-1] - deviance[-1]
 
 
 @in_float64
+@one_thread()
 def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: str) -> Profile:
     """`Fit.profile`."""
     names = fit.circuit.names()
@@ -117,8 +119,9 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
     number = names.index(name)
     if known.elements is not None and known.elements.width[number] <= FIXED:
         raise ValueError(f"{name} is fixed, so it has no profile; take another element")
-    wanted = jax.device_put((np.asarray(number), np.sqrt(np.diagonal(cov))))
-    logs, deviance = map(np.asarray, _profile(lane, known, fit.circuit, *wanted))
+    least = Minimum.of(lane, known, fit.circuit)
+    of = known, fit.circuit, number, np.sqrt(np.diagonal(cov))
+    logs, deviance = _profile(least, *of)
     ends = {one: (low, high) for one, low, high in known.bounds}
     return Profile(
         name=name,

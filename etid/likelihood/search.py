@@ -191,13 +191,14 @@ class _Knots:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Anew:
+class Anew:
     """Terms that are condensed anew at each point."""
 
     load: Load
     at_knots: Gains
 
     def equations(self, q: Float[AnyArray, "*row q"]) -> NormalEquations:
+        """The normal equations at a point."""
         return self.at(Near.of(self.load, self.at_knots, q))
 
     def at(self, near: Near) -> NormalEquations:
@@ -206,8 +207,9 @@ class _Anew:
         objective = xp.where(xp.isfinite(found.objective), near.objective, np.inf)
         return found._replace(objective=objective)
 
-    def of(self, rows: np.ndarray) -> "_Anew":
-        return _Anew(self.load.of(rows), self.at_knots.of(rows))
+    def of(self, rows: np.ndarray) -> "Anew":
+        """Some of the rows."""
+        return Anew(self.load.of(rows), self.at_knots.of(rows))
 
 
 class Minimum(NamedTuple):
@@ -314,7 +316,7 @@ def _approached(load: Load, at_knots: Gains, near: Near) -> Near:
 
     The likelihood is condensed anew at each step of Levenberg-Marquardt.
     """
-    problem = _Anew(load, at_knots)
+    problem = Anew(load, at_knots)
     search = LevenbergMarquardt(damping=1e-2, steps=STEPS)
     found = search(problem, near.q, problem.at(near), ROUGHLY * near.objective)
     return Near.of(load, at_knots, found.q)
