@@ -1,5 +1,6 @@
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from etid import (
     series,
 )
 from etid.circuits import lookup
+from etid.circuits.circuit import too_steep
 from etid.signals.transfer import frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
@@ -94,8 +96,11 @@ def test_a_constant_phase_is_no_ratio_of_polynomials():
 
 
 def test_an_exponent_is_too_steep_if_its_error_does_not_explain_it():
-    cov = jnp.diag(jnp.array([1e-6, 1e-6, 1e-6, 0.01**2]))
-    for alpha, expected in ((0.9, False), (1.03, False), (1.05, True)):
-        found = SkinCole().with_log_values(SkinCole(20e3, 100e3, 30e-6, alpha).log_values())
-        assert bool(found.is_too_steep(cov)) == expected
-    assert not bool(SkinRC().is_too_steep(jnp.eye(3)))
+    """Of rows in NumPy, and of one circuit in JAX."""
+    cov = np.diag([1e-6, 1e-6, 1e-6, 0.01**2])
+    logs = np.log([SkinCole(20e3, 100e3, 30e-6, alpha).values() for alpha in (0.9, 1.03, 1.05)])
+    np.testing.assert_array_equal(
+        too_steep(SkinCole(), logs, np.stack([cov] * 3)), [False, False, True]
+    )
+    assert bool(jax.jit(lambda logs: too_steep(SkinCole(), logs, jnp.asarray(cov)))(logs[2]))
+    assert not too_steep(SkinRC(), SkinRC().log_values(), np.eye(3))

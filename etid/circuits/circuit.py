@@ -33,7 +33,6 @@ from etid.circuits.elements import (
 )
 from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
 from etid.circuits.overview import Overview, Overviewed, element_rows
-from etid.numpy_tier.tiers import program
 from etid.precision import Module, in_float64, namespace
 from etid.signals.missing import unmasked
 from etid.signals.transfer import AnyArray, frequency_variable, widened
@@ -41,6 +40,8 @@ from etid.signals.transfer import AnyArray, frequency_variable, widened
 _Same = TypeVar("_Same", bound="AbstractCircuit")
 
 STEP = 3e-6  # of ln element; differences of ln (τ^α / R) are then right to 1e-10
+STEP_OF_EXPONENT = 1e-5  # of ln element, for the slope of an exponent
+STEEP = 4.0  # standard errors by which an exponent exceeds 1: by chance once in 30 000
 
 
 def parameter(unit: str, *, typical: float) -> Any:
@@ -152,10 +153,12 @@ class AbstractCircuit(_Titled, Overviewed, Module):
         values = [_plain(getattr(self, name)) for name in self.names()]
         return namespace(*values).stack(values, axis=-1)
 
-    @program
-    def log_values(self) -> Float[Array, "*lane parameter"]:
-        """Natural logarithms of the parameters in SI units."""
-        return jnp.log(self.values())
+    @in_float64
+    @np.errstate(all="ignore")  # elements of a fit that failed may be 0
+    def log_values(self) -> Float[AnyArray, "*lane parameter"]:
+        """Natural logarithms of the parameters in SI units, in the namespace of `values`."""
+        values = self.values()
+        return namespace(values).log(values)
 
     def with_log_values(
         self: _Same, log_values: Float[Array | np.ndarray, "*lane parameter"]
@@ -188,24 +191,6 @@ class AbstractCircuit(_Titled, Overviewed, Module):
     def exponents(self) -> tuple[Quantity, ...]:
         """Exponents α of the powers of s in the impedance; empty for a ratio of polynomials."""
         return self.impedance().exponents() if _has_exponents(type(self)) else ()
-
-    def is_too_steep(self, cov: Float[Array, "parameter parameter"]) -> Bool[Array, ""]:
-        """Whether an exponent α exceeds 1 by more than four standard errors.
-
-        The impedance of a passive element cannot fall faster than that of a capacitor (α = 1). If
-        the true α is 1, noise makes the fitted α exceed 1 in every second fit, mostly by less than
-        one standard error, and by more than four in one of 30 000 fits.
-        """
-
-        def alphas(log_values: Float[Array, " parameter"]) -> Float[Array, " exponent"]:
-            exponents = self.with_log_values(log_values).exponents()
-            return jnp.stack([jnp.asarray(alpha) for alpha in exponents])
-
-        if not self.exponents():
-            return jnp.array(False)
-        slope = jax.jacfwd(alphas)(self.log_values())
-        error = jnp.sqrt(jnp.diagonal(slope @ cov @ slope.T))
-        return jnp.any(alphas(self.log_values()) - 1 > 4 * error)
 
     def _overview(self) -> Overview:
         kind, values = type(self).__name__, np.asarray(self.values())
@@ -289,6 +274,39 @@ def with_slopes(
     for place, slope in enumerate(sums):
         by_element[..., place, :] = 0.0 if slope is None else slope
     return _as_rows(np, value, (*rows, band)), by_element
+
+
+@np.errstate(all="ignore")
+def too_steep(
+    circuit: AbstractCircuit,
+    logs: Float[AnyArray, "*row element"],
+    cov: Float[AnyArray, "*row element element"],
+) -> Bool[AnyArray, "*row"]:
+    """Whether an exponent α exceeds 1 by more than four standard errors.
+
+    The impedance of a passive element cannot fall faster than that of a capacitor (α = 1). If the
+    true α is 1, noise makes the fitted α exceed 1 in every second fit, mostly by less than one
+    standard error, and by more than four in one of 30 000 fits.
+
+    Args:
+        circuit: Structure of the circuits.
+        logs: Logarithms of their elements.
+        cov: Covariance of the logarithms.
+    """
+    xp, size = namespace(logs, cov), logs.shape[-1]
+    if not circuit.exponents():
+        return xp.zeros(logs.shape[:-1], bool)
+
+    def alphas(logs: Float[AnyArray, "*row element"]) -> Float[AnyArray, "*row exponent"]:
+        values = xp.exp(logs)
+        of = circuit.of_fit([values[..., place] for place in range(size)])
+        return xp.stack([xp.broadcast_to(one, logs.shape[:-1]) for one in of.exponents()], -1)
+
+    steps = STEP_OF_EXPONENT * np.eye(size)
+    slopes = [(alphas(logs + one) - alphas(logs - one)) / (2 * STEP_OF_EXPONENT) for one in steps]
+    slope = xp.stack(slopes, -1)
+    error = xp.sqrt(((slope @ cov) * slope).sum(-1))
+    return (alphas(logs) - 1 > STEEP * error).any(-1)
 
 
 def _tree(kind: type[AbstractCircuit], values: Sequence[AnyArray]) -> AbstractImpedance:

@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.branches import exchangeable, in_order
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, too_steep
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
@@ -105,7 +105,7 @@ def judged(
         result=first_verdict(
             (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
-            (fitted.is_too_steep(estimate.cov), RESULTS.nonphysical),
+            (too_steep(fitted, fitted.log_values(), estimate.cov), RESULTS.nonphysical),
             (~settled, MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
             (estimate.falls, RESULTS.misfit),  # which can pass for a change of the driver

@@ -9,9 +9,8 @@ over the logarithms of the elements. Files of instruments have no standard error
 taken to be a part of |Z|, and the fit minimises Σ_k |ln(Z(jω_k) / Z_k)|²: the relative error of the
 magnitude and the error of the phase. It has no weights, which would come from noisy impedances.
 
-The fit starts at several corner frequencies that span the data, each with the best of several
-impedance levels, and keeps the best minimum. From a single start, two layers sometimes ended as
-one.
+The fit starts at several corner frequencies that span the data, each with several impedance levels,
+and keeps the best minimum. From a single start, two layers sometimes ended as one.
 
 Without standard errors the residual alone says whether the circuit is right; `_judged` does.
 """
@@ -20,16 +19,13 @@ import dataclasses
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
-import optimistix as optx
 import scipy
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from etid.circuits.branches import in_order
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, too_steep, with_slopes
 from etid.circuits.display import several
 from etid.estimators.element_prior import Known, checked
 from etid.identify.arguments import circuit_of, known_elements
@@ -40,17 +36,24 @@ from etid.identify.kramers_kronig import (
     checked_spectrum,
     kramers_kronig,
 )
-from etid.numpy_tier.tiers import program
-from etid.precision import in_float64
+from etid.likelihood.linear import LevenbergMarquardt, NormalEquations
+from etid.numpy_tier.algebra import one_thread
+from etid.precision import array_function, in_float64
 from etid.recordings.remarks import Remark, texts
 from etid.results.data import MeasuredImpedance, with_data
 from etid.results.driver import AUTO
 from etid.results.fit import Fit, IdentificationError, Support, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, verdict
-from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
+from etid.signals.harmonics import real_parts
 from etid.solvers.matrices import inverse
 
 LACK = 1e-4  # by chance, if the chain is given; its choice makes it three times as likely
+CORNERS = 5  # over the band
+LEVELS = np.log(np.geomspace(0.1, 10.0, 5))  # around that of the data
+# Three steps in a row that reduce the sum of squares by less than this part end a fit, at a
+# distance of less than 1e-4 standard errors from its minimum.
+ENOUGH = 1e-8
+ROUNDING = 1e-13  # of Z, below which a residual is none
 
 
 class PassiveFit(NamedTuple):
@@ -61,96 +64,124 @@ class PassiveFit(NamedTuple):
         most: Sum of squares of a right circuit, which chance exceeds in `LACK` (F test).
     """
 
-    square: float | Float[Array, ""]
-    most: float | Float[Array, ""]
+    square: float
+    most: float
 
 
-@program
-def _fit(
-    frequency: Float[Array, " frequency"],
-    z: Complex[Array, " frequency"],
-    noise: Float[Array, " frequency"] | PassiveFit,
-    circuit: AbstractCircuit,
-    free: tuple[int, ...],
-) -> Fit:
-    passive = noise if isinstance(noise, PassiveFit) else None
-    sigma = None if isinstance(noise, PassiveFit) else noise
-    known = passive is None
+@dataclasses.dataclass(frozen=True)
+class _Spectrum:
+    """The terms of a spectrum, whose unknowns are the logarithms of the free elements.
 
-    rows, told = np.array(free), jnp.asarray(circuit.log_values())
+    Attributes:
+        frequency: Frequencies [Hz].
+        z: Impedance [Ω].
+        sigma: Standard errors [Ω]; None if the noise is a part of |Z|.
+        circuit: Structure of the circuit.
+        told: Logarithms of its elements, of which those that are not free are known.
+        free: Numbers of the free elements.
+    """
 
-    def elements(q: Float[Array, " free"]) -> Float[Array, " element"]:
-        return told.at[rows].set(q)
+    frequency: Float[np.ndarray, " frequency"]
+    z: Complex[np.ndarray, " frequency"]
+    sigma: Float[np.ndarray, " frequency"] | None
+    circuit: AbstractCircuit
+    told: Float[np.ndarray, " element"]
+    free: list[int]
 
-    def residual(q: Float[Array, " free"], _) -> Float[Array, " part"]:
-        fitted = circuit.with_log_values(elements(q)).response(frequency)
-        missed = jnp.log(fitted / z) if sigma is None else (fitted - z) / sigma.astype(z.dtype)
-        return jnp.concatenate([missed.real, missed.imag])
+    def logs(self, q: Float[np.ndarray, "row free"]) -> Float[np.ndarray, "row element"]:
+        """Logarithms of all elements."""
+        logs = np.tile(self.told, (len(q), 1))
+        logs[:, self.free] = q
+        return logs
 
-    # If a circuit is scaled in impedance by g and in frequency by t, R becomes R·g, C becomes
-    # C/(g t).
-    typical, (of_level, of_time) = circuit.log_values(), circuit.scaling()
-    size = jnp.log(jnp.median(jnp.abs(z)) / jnp.median(jnp.abs(circuit.response(frequency))))
-    slow = (of_time > 0) & (of_level <= 0)  # an inductor's time constant is not that of a corner
-    resistance = typical[jnp.argmax(jnp.where(of_time > 0, -jnp.inf, of_level))]
-    times = (typical - of_level * resistance) / jnp.where(slow, of_time, 1.0)
-    shortest = jnp.where(slow, times, jnp.inf).min()
-    corner = jnp.where(slow.any(), 1 / (2 * jnp.pi * jnp.exp(shortest)), 1.0)  # [Hz], roughly
-    corners = jnp.exp(jnp.linspace(jnp.log(frequency.min()), jnp.log(frequency.max()), 5))
-    levels = size + jnp.log(np.geomspace(0.1, 10.0, 5))
+    def equations(self, q: Float[np.ndarray, "row free"]) -> NormalEquations:
+        """The normal equations."""
+        z, slopes = with_slopes(self.circuit, self.logs(q), self.frequency[None])
+        scale = z if self.sigma is None else self.sigma
+        missed = np.log(z / self.z) if self.sigma is None else (z - self.z) / scale
+        slopes = slopes[:, self.free] / np.broadcast_to(scale, z.shape)[:, None]
+        return NormalEquations.of(real_parts(missed), real_parts(slopes))
 
-    def from_corner(faster: Float[Array, ""]) -> optx.Solution:
-        starts = (typical - of_time * faster)[None, :] + levels[:, None] * of_level[None, :]
-        starts = starts[:, rows]
-        q0 = best_start(lambda q: residual(q, None), starts)
-        solver = LevenbergMarquardt()
-        return optx.least_squares(residual, solver, q0, max_steps=500, throw=False)
+    def of(self, rows: np.ndarray) -> "_Spectrum":
+        """The terms of some rows: they are those of all."""
+        del rows
+        return self
 
-    every = jax.lax.map(from_corner, jnp.log(corners / corner))
-    likeliest = jnp.nanargmin(every.stats["normal_equations"].objective)
-    solution = jax.tree.map(lambda one: one[likeliest], every)
-    q = solution.value
-    equations = solution.stats["normal_equations"]
-    chi2 = 2 * equations.objective / (2 * z.size - q.size)
+    def starts(self) -> Float[np.ndarray, "start free"]:
+        """Each corner frequency with each impedance level.
+
+        If a circuit is scaled in impedance by g and in frequency by t, R becomes R·g, C becomes
+        C/(g t).
+        """
+        typical, (of_level, of_time) = self.told, self.circuit.scaling()
+        slow = (of_time > 0) & (of_level <= 0)  # an inductor's time constant is not of a corner
+        resistance = typical[np.argmax(np.where(of_time > 0, -np.inf, of_level))]
+        corner = 1.0  # [Hz], roughly
+        if slow.any():
+            times = (typical - of_level * resistance)[slow] / of_time[slow]
+            corner = 1 / (2 * np.pi * np.exp(times.min()))
+        first, last = np.log(self.frequency[[0, -1]] / corner)
+        faster = np.linspace(first, last, CORNERS)
+        usual = np.median(np.abs(self.circuit.response(self.frequency)))
+        levels = np.log(np.median(np.abs(self.z)) / usual) + LEVELS
+        moved = levels[:, None] * of_level - faster[:, None, None] * of_time
+        return (typical + moved.reshape(-1, typical.size))[:, self.free]
+
+
+@array_function
+def _fit(spectrum: _Spectrum, passive: PassiveFit | None) -> Fit:
+    """The fit of a spectrum, of rising frequency; `passive` judges it without standard errors."""
+    circuit, free, f, z = spectrum.circuit, spectrum.free, spectrum.frequency, spectrum.z
+    starts = spectrum.starts()
+    weight = 1.0 if spectrum.sigma is None else np.abs(z) / spectrum.sigma
+    search = LevenbergMarquardt(damping=1e-2, steps=500, patience=3, relative=ENOUGH)
+    exact = z.size * float(np.mean((ROUNDING * weight) ** 2))
+    found = search(spectrum, starts, spectrum.equations(starts), exact)
+    best = int(np.argmin(found.equations.objective))
+    q, squares = found.q[best], 2 * found.equations.objective[best]
+    settled = np.isfinite(squares) & ~found.moves[best]
+    chi2 = squares / (2 * z.size - q.size)
+    equations = spectrum.equations(q[None])
+    assert equations.terms is not None
+    assert equations.rows is not None
     if passive is None:
-        cov = inverse(equations.matrix) * jnp.maximum(chi2, 1.0)
-        misfit, remark = chi2 > MISFIT_CHI2, jnp.zeros((), int)
+        cov = inverse(equations.matrix[0]) * np.maximum(chi2, 1.0)
+        misfit, remark = chi2 > MISFIT_CHI2, 0
     else:
-        cov, excess = _judged(residual(q, None), jax.jacfwd(residual)(q, None), passive)
-        misfit, remark = excess > FAIL, jnp.where(excess > EXACT, int(Remark.not_noise), 0)
-    if len(free) == len(circuit.names()):  # a fixed element names its branch
-        places = in_order(circuit, q)
-        q, cov = q[places], cov[places][:, places]
-    # Fixed elements are as they were told, to the last digit.
-    values = jnp.asarray(circuit.values()).at[rows].set(jnp.exp(q))
-    fitted = circuit.with_values(values)
-    cov = jnp.zeros((values.size, values.size)).at[np.ix_(rows, rows)].set(cov)
-    settled = solution.result == optx.RESULTS.successful
-    terms = jnp.asarray(2.0 * z.size)
+        cov, excess = _judged(equations.terms[0], equations.rows[0].T, passive)
+        misfit, remark = excess > FAIL, int(Remark.not_noise) if excess > EXACT else 0
+    values = np.array(circuit.values())
+    if len(free) == values.size:  # a fixed element names its branch
+        places = np.asarray(in_order(circuit, q))
+        q, cov = q[places], cov[np.ix_(places, places)]
+    values[free] = np.exp(q)  # fixed elements are as they were told, to the last digit
+    whole = np.zeros((values.size, values.size))
+    whole[np.ix_(free, free)] = cov
+    fitted = circuit.of_fit(values)
     support = dataclasses.replace(  # no changes of the circuit are tested
-        Support.unknown(values.size), deviance=2 * equations.objective, terms=terms
+        Support.unknown(values.size), deviance=np.asarray(squares), terms=np.asarray(2.0 * z.size)
     )
     return Fit(
         circuit=fitted,
-        cov=cov * jnp.outer(values, values),
-        shared_cov=jnp.zeros_like(cov),
-        rrse=complex_rrse(jnp.asarray(fitted.response(frequency)), z),
-        chi2=chi2 if known else jnp.asarray(jnp.nan),
+        cov=whole * np.outer(values, values),
+        shared_cov=np.zeros_like(whole),
+        rrse=np.asarray(complex_rrse(np.asarray(fitted.response(f)), z)),
+        chi2=np.asarray(chi2 if passive is None else np.nan),
         result=first_verdict(
-            (~jnp.isfinite(values).all(), RESULTS.nonphysical),
-            (fitted.is_too_steep(cov), RESULTS.nonphysical),
+            (~np.isfinite(values).all(), RESULTS.nonphysical),
+            (np.bool_(too_steep(circuit, np.log(values), whole)), RESULTS.nonphysical),
             (~settled, verdict("max_steps_reached")),
             (misfit, RESULTS.misfit),
-            (~(jnp.sqrt(jnp.diagonal(cov)) < 1).all(), RESULTS.insensitive),
+            (~(np.sqrt(np.diagonal(whole)) < 1).all(), RESULTS.insensitive),
         ),
-        steps=solution.stats["num_steps"],
+        steps=np.asarray(found.steps[best]),
         method="impedance",
-        remarks=remark,
-        support=support if known else None,
+        remarks=np.asarray(remark),
+        support=support if passive is None else None,
     )
 
 
-def _held(circuit: AbstractCircuit, known: Known) -> tuple[AbstractCircuit, tuple[int, ...]]:
+def _held(circuit: AbstractCircuit, known: Known) -> tuple[AbstractCircuit, list[int]]:
     """The circuit with its fixed elements, and the numbers of the free ones.
 
     Raises:
@@ -161,15 +192,15 @@ def _held(circuit: AbstractCircuit, known: Known) -> tuple[AbstractCircuit, tupl
     for name, value, _ in known:
         values[names.index(name)] = value
     held = {name for name, *_ in known}
-    free = tuple(row for row, name in enumerate(names) if name not in held)
+    free = [row for row, name in enumerate(names) if name not in held]
     if not free:
         raise ValueError("fixed holds every element; leave at least one free")
     return circuit.with_values(values), free
 
 
 def _judged(
-    e: Float[Array, " part"], slope: Float[Array, "part element"], passive: PassiveFit
-) -> tuple[Float[Array, "element element"], Float[Array, ""]]:
+    e: Float[np.ndarray, " part"], slope: Float[np.ndarray, "part element"], passive: PassiveFit
+) -> tuple[Float[np.ndarray, "element element"], np.float64]:
     """Covariance of the logarithms, and the rms part of the residual that is not noise.
 
     Three signs show a residual that is not white noise, each of which says how large the noise is:
@@ -186,20 +217,20 @@ def _judged(
     """
     n, p = slope.shape
     parts = e.reshape(2, -1)
-    square = jnp.sum(e**2) / (n - p)
-    of_steps = jnp.mean((parts[:, 1:] - parts[:, :-1]) ** 2) / 2
-    rho = 1 - of_steps / jnp.where(square > 0, square, 1.0)
-    usual = (jnp.median(jnp.abs(e)) / 0.6745) ** 2  # the median of the size of a normal number
+    square = np.sum(e**2) / (n - p)
+    of_steps = np.mean((parts[:, 1:] - parts[:, :-1]) ** 2) / 2
+    rho = 1 - of_steps / np.where(square > 0, square, 1.0)
+    usual = (np.median(np.abs(e)) / 0.6745) ** 2  # the median of the size of a normal number
     # By chance 1 spectrum in 4 000 has such runs, 5 of 1 000 000 of 40 frequencies such tails.
-    signs = [rho > 3.5 / n**0.5, jnp.sum(e**2) > passive.most, square > 2.5**2 * usual]
-    noise = jnp.stack([of_steps, passive.square, usual])
-    excess = jnp.sqrt(jnp.max(jnp.where(jnp.stack(signs), square - noise, 0.0)))
+    signs = [rho > 3.5 / n**0.5, np.sum(e**2) > passive.most, square > 2.5**2 * usual]
+    noise = np.stack([of_steps, passive.square, usual])
+    excess = np.sqrt(np.max(np.where(np.stack(signs), square - noise, 0.0)))
     equal = inverse(slope.T @ slope)
-    alone = slope * (e / (1 - jnp.sum((slope @ equal) * slope, axis=1)))[:, None]
+    alone = slope * (e / (1 - np.sum((slope @ equal) * slope, axis=1)))[:, None]
     cov = equal @ (alone.T @ alone) @ equal
-    grown = jnp.fmax(square * jnp.diagonal(equal) / jnp.diagonal(cov), 1.0)  # NaN if all are 0
-    grown *= jnp.where(excess > 0, jnp.clip((1 + rho) / (1 - rho), 1.0, n), 1.0)
-    return cov * jnp.sqrt(jnp.outer(grown, grown)), excess
+    grown = np.fmax(square * np.diagonal(equal) / np.diagonal(cov), 1.0)  # NaN if all are 0
+    grown *= np.where(excess > 0, np.clip((1 + rho) / (1 - rho), 1.0, n), 1.0)
+    return cov * np.sqrt(np.outer(grown, grown)), excess
 
 
 def _passive_fit(
@@ -226,6 +257,7 @@ def _remarks(z: Complex[np.ndarray, " frequency"]) -> Remark:
 
 
 @in_float64
+@one_thread()
 def identify_impedance(
     frequency: npt.ArrayLike,
     impedance: npt.ArrayLike,
@@ -270,9 +302,10 @@ def identify_impedance(
         given, wanted = several(f.size, "impedance"), several(len(free), "element")
         raise ValueError(f"{given} cannot determine {wanted}")
     rising = np.argsort(f, kind="stable")  # neighbours are compared
-    noise = _passive_fit(f[rising], z[rising], len(free)) if sigma is None else sigma[rising]
-    put = jax.device_put
-    fit = jax.device_get(_fit(put(f[rising]), put(z[rising]), put(noise), structure, free))
+    f_up, z_up = f[rising], z[rising]
+    passive = _passive_fit(f_up, z_up, len(free)) if sigma is None else None
+    noise = None if sigma is None else sigma[rising]
+    fit = _fit(_Spectrum(f_up, z_up, noise, structure, structure.log_values(), free), passive)
     if fit.verdict != "successful":
         fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | int(_remarks(z))))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))

@@ -160,12 +160,14 @@ class LevenbergMarquardt:
         patience: So many steps in a row that bring no more than is enough end the search; the last
             of them is not taken.
         curved: Whether steps follow the curvature of the terms, which are then `Curved`.
+        relative: Part of the objective that is always enough.
     """
 
     damping: float
     steps: int
     patience: int = 1
     curved: bool = False
+    relative: float = 0.0
 
     def __call__(
         self,
@@ -202,7 +204,7 @@ class LevenbergMarquardt:
         xp, at = namespace(state.q), state.equations
         scale = xp.maximum(state.scale, at.scale)
         move = at.step(state.damping, scale)
-        ends = state.idle + (at.promised(move) <= state.enough) >= self.patience
+        ends = state.idle + (at.promised(move) <= self._enough(state)) >= self.patience
         if self.curved:
             bent = at._replace(gradient=cast("Curved", problem).bend(state.q, at, move))
             turned = 0.5 * bent.step(state.damping, scale)
@@ -221,12 +223,16 @@ class LevenbergMarquardt:
         good = better & (reduced >= GOOD * promised)
         damping = xp.where(better, state.damping, xp.maximum(state.damping, LEAST) * 4)
         damping = xp.where(good, 0.2 * state.damping, damping)
-        small = xp.maximum(promised, reduced) <= state.enough
+        small = xp.maximum(promised, reduced) <= self._enough(state)
         idle = xp.where(better, xp.where(small, state.idle + 1, 0), state.idle)
         q, *kept = chosen(better, (trial, *new), (state.q, *old))
         steps = state.steps + state.moves
         found = state._replace(q=q, damping=damping, idle=idle, steps=steps)
         return self._proposed(problem, found._replace(equations=NormalEquations(*kept)))
+
+    def _enough(self, state: State) -> Float[AnyArray, "*row"]:
+        least = self.relative * state.equations.objective
+        return namespace(least).maximum(state.enough, least)
 
 
 def bend(

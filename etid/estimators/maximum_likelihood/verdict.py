@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from etid.circuits.branches import exchangeable, in_order
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, too_steep
 from etid.estimators.element_limits import Limits, Within, limited, of_circuit, within
 from etid.estimators.element_prior import FIXED
 from etid.estimators.judgement import STRAINED, SUCCESSFUL, misses
@@ -24,9 +24,6 @@ from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Limited
 from etid.results.verdicts import RESULTS, verdicts_of
-
-STEEP = 4.0  # standard errors by which an exponent exceeds 1: by chance once in 30 000
-STEP = 1e-5  # of the logarithm of an element, for the slope of an exponent
 
 
 def judged(
@@ -71,7 +68,7 @@ def judged(
     verdicts = (
         (~np.isfinite(found.chi2), "unstable"),
         (~np.isfinite(values).all(-1), "nonphysical"),
-        (_too_steep(circuit, found), "nonphysical"),
+        (too_steep(circuit, found.logs, found.cov), "nonphysical"),
         (~found.settled, "max_steps_reached"),
         (misses(found.chi2, found.rrse) | late, "misfit"),
         (found.falls, "misfit"),  # which can pass for a change of the driver
@@ -138,25 +135,6 @@ def _limits(
     assert found is not None
     lower, upper = (np.tile(end, (count, 1)) for end in (found.lower, found.upper))
     return Limited(lower, upper, outside)
-
-
-def _too_steep(circuit: AbstractCircuit, found: Estimate) -> Bool[np.ndarray, " row"]:
-    """Whether an exponent α surely exceeds 1: no passive impedance falls faster.
-
-    If the true α is 1, noise makes the fitted α exceed 1 in every second fit.
-    """
-    if not circuit.exponents():
-        return np.zeros(len(found.logs), bool)
-
-    def alphas(logs: Float[np.ndarray, "row element"]) -> Float[np.ndarray, "row exponent"]:
-        of = circuit.of_fit(np.moveaxis(np.exp(logs), -1, 0))
-        return np.stack([np.broadcast_to(one, len(logs)) for one in of.exponents()], -1)
-
-    steps = STEP * np.eye(found.logs.shape[-1])
-    slopes = [(alphas(found.logs + one) - alphas(found.logs - one)) / (2 * STEP) for one in steps]
-    slope = np.stack(slopes, -1)
-    error = np.sqrt(((slope @ found.cov) * slope).sum(-1))
-    return (alphas(found.logs) - 1 > STEEP * error).any(-1)
 
 
 def _ordered(
