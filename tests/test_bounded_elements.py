@@ -50,8 +50,9 @@ def above(fit, errors):
 )
 def test_moments_of_a_truncated_normal_are_those_of_scipy(low, high):
     mean, deviation = 5.0, 2.0
-    ends = (jnp.asarray(mean + deviation * end) for end in (low, high))
-    found = truncated(jnp.asarray(mean), jnp.asarray(deviation), *ends)
+    found = truncated(
+        *map(np.array, (mean, deviation, *(mean + deviation * np.array([low, high]))))
+    )
     # SciPy's own moments lose digits far out, so the integral is compared: by its density.
     x = np.linspace(low, min(high, low + 10.0), 200_001)
     weight = np.exp(scipy.stats.norm.logpdf(x) - scipy.stats.norm.logpdf(x).max())
@@ -67,7 +68,7 @@ def test_several_bounded_elements_are_those_of_draws_inside_the_box():
     related = np.array([[1, -0.9, 0.5], [-0.9, 1, -0.4], [0.5, -0.4, 1]])
     cov = related * np.outer(deviation, deviation)
     bounds = (("r_s", 33e3, np.inf), ("r_p", 170e3, 182e3))
-    found = within(circuit, jnp.asarray(cov), jnp.asarray(0.5 * cov), bounds)
+    found = within(circuit, circuit.values(), cov, 0.5 * cov, bounds)
     x = np.random.default_rng(2).multivariate_normal(circuit.values(), cov, 100_000)
     x = x[(x[:, 0] > 33e3) & (x[:, 1] > 170e3) & (x[:, 1] < 182e3)]
     # Expectation propagation is not exact for several elements; a tenth of an error is no harm.
@@ -78,17 +79,28 @@ def test_several_bounded_elements_are_those_of_draws_inside_the_box():
     own = np.linalg.eigvalsh((found.cov - found.shared_cov) / np.outer(deviation, deviation))
     assert own.min() > 0
     # R_s moves R_p with it, below 0.
-    far = within(circuit, jnp.asarray(cov), jnp.asarray(cov), (("r_s", 500e3, np.inf),))
+    far = within(circuit, circuit.values(), cov, cov, (("r_s", 500e3, np.inf),))
     assert np.isnan(far.values).all()
     assert bool(far.contradicted)
 
 
 def test_the_deviance_of_several_bounds_is_that_of_the_nearest_point_between_them():
-    """A bound far away leaves its element free to follow: two standard errors of R_s cost 4."""
+    """A bound far away leaves its element free to follow: two standard errors of R_s cost 4.
+
+    In NumPy and in JAX.
+    """
     circuit, deviation = etid.SkinRC(30e3, 180e3, 0.1e-9), np.array([3e3, 3e3, 3e-12])
     related = np.array([[1, -0.9, 0], [-0.9, 1, 0], [0, 0, 1]])
-    cov = jnp.asarray(related * np.outer(deviation, deviation))
-    found = within(circuit, cov, cov, (("r_s", 36e3, np.inf), ("r_p", 90e3, 270e3)))
+    cov, bounds = (
+        related * np.outer(deviation, deviation),
+        (("r_s", 36e3, np.inf), ("r_p", 90e3, 270e3)),
+    )
+    found = within(circuit, circuit.values(), cov, cov, bounds)
+    traced = jax.jit(
+        lambda values: within(circuit, values, jnp.asarray(cov), jnp.asarray(cov), bounds)
+    )
+    for one, other in zip(found, traced(jnp.asarray(circuit.values())), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
     np.testing.assert_allclose(found.deviance, 4.0, rtol=1e-6)
 
 
@@ -98,15 +110,12 @@ RELATED = np.array([[1, -0.8, 0.5], [-0.8, 1, -0.4], [0.5, -0.4, 1]])
 
 def coverage(bounds, draws=10_000):
     """Part of the intervals of 95 % that contain the truth, for each element."""
-    cov = jnp.asarray(RELATED * np.outer(ERROR, ERROR))
+    cov = RELATED * np.outer(ERROR, ERROR)
     drawn = np.random.default_rng(1).multivariate_normal(TRUTH, cov, draws)
-
-    def one(values):
-        found = within(etid.SkinRC(*values), cov, cov, bounds)
-        return found.values, jnp.sqrt(jnp.diagonal(found.cov))
-
-    values, errors = jax.jit(jax.vmap(one))(jnp.asarray(drawn))
-    return np.mean(np.abs(np.asarray(values) - TRUTH) < 1.96 * np.asarray(errors), axis=0)
+    covs = np.broadcast_to(cov, (draws, 3, 3))
+    found = within(etid.SkinRC(), drawn, covs, covs, bounds)
+    errors = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    return np.mean(np.abs(found.values - TRUTH) < 1.96 * errors, axis=0)
 
 
 @pytest.mark.parametrize("from_bound", [0.0, 1.0, 4.0])

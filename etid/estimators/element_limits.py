@@ -12,18 +12,20 @@ The point of the largest likelihood would often lie on a bound, and have no stan
 """
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import Known, require_element
+from etid.likelihood.linear import diagonal, inverse
+from etid.precision import array_function, namespace
 from etid.results.fit import Limited
+from etid.signals.transfer import AnyArray
 
 Limits = tuple[tuple[str, float, float], ...]
 """Elements with bounds: name, lower and upper bound [SI]; infinity without an upper bound."""
@@ -49,117 +51,145 @@ class Within(NamedTuple):
         contradicted: Whether the bounds are no longer credible.
     """
 
-    values: Float[Array, " element"]
-    cov: Float[Array, "element element"]
-    shared_cov: Float[Array, "element element"]
-    outside: Float[Array, " element"]
-    deviance: Float[Array, ""]
-    contradicted: Bool[Array, ""]
+    values: Float[AnyArray, "*row element"]
+    cov: Float[AnyArray, "*row element element"]
+    shared_cov: Float[AnyArray, "*row element element"]
+    outside: Float[AnyArray, "*row element"]
+    deviance: Float[AnyArray, "*row"]
+    contradicted: Bool[AnyArray, "*row"]
 
 
+@array_function
 def within(
     circuit: AbstractCircuit,
-    cov: Float[Array, "element element"],
-    shared_cov: Float[Array, "element element"],
+    values: Float[AnyArray, "*row element"],
+    cov: Float[AnyArray, "*row element element"],
+    shared_cov: Float[AnyArray, "*row element element"],
     bounds: Limits,
 ) -> Within:
-    """The elements of a free fit inside their bounds.
+    """The elements of free fits inside their bounds.
 
     If the bounds move an element so far that it would be negative, or if there is no covariance,
     all numbers are NaN.
+
+    Args:
+        circuit: Structure of the circuit.
+        values: Elements of the free fits [SI].
+        cov: Their covariance.
+        shared_cov: The part of it that comes from the driver.
+        bounds: The bounds.
     """
+    xp = namespace(values, cov)
     rows = np.array([circuit.names().index(name) for name, *_ in bounds])
-    lower = jnp.array([low for _, low, _ in bounds])
-    upper = jnp.array([high for *_, high in bounds])
-    free, scale = circuit.values(), jnp.sqrt(jnp.diagonal(cov))
+    lower, upper = (np.array([one[end] for one in bounds]) for end in (1, 2))
+    scale, size, every = xp.sqrt(diagonal(cov)), rows.size, np.eye(values.shape[-1])
     # In standard errors, from the free estimate.
-    low, high = (lower - free[rows]) / scale[rows], (upper - free[rows]) / scale[rows]
-    whole = cov / jnp.outer(scale, scale)
-    some = whole[:, rows]
+    low, high = ((end - values[..., rows]) / scale[..., rows] for end in (lower, upper))
+    outer = scale[..., :, None] * scale[..., None, :]
+    whole = cov / outer
+    some = whole[..., rows]
+    both = some[..., rows, :]
 
-    def posterior(
-        precision: Float[Array, " bound"], shift: Float[Array, " bound"]
-    ) -> tuple[Float[Array, " bound"], Float[Array, "element bound"], Float[Array, "bound bound"]]:
+    def posterior(precision: AnyArray, shift: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
         """u, where the mean is C_B u; the gain C_B (1 + T C_BB)⁻¹; and the covariance of B."""
-        inner = jnp.eye(rows.size) + precision[:, None] * some[rows]
-        gain = jnp.linalg.solve(inner.T, some.T).T
-        moved = gain[rows] @ (precision[:, None] * some[rows].T)
-        return jnp.linalg.solve(inner, shift), gain, some[rows] - moved
+        inner = np.eye(size) + precision[..., :, None] * both
+        gain = xp.linalg.solve(inner.swapaxes(-1, -2), some.swapaxes(-1, -2)).swapaxes(-1, -2)
+        moved = gain[..., rows, :] @ (precision[..., :, None] * both)
+        return xp.linalg.solve(inner, shift[..., None])[..., 0], gain, both - moved
 
-    def one(i: Array, sites: tuple[Array, Array]) -> tuple[Array, Array]:
-        precision, shift = sites
-        u, _, spread = posterior(precision, shift)
-        own, mean = spread[i, i], some[rows][i] @ u
-        cavity = 1 / (1 / own - precision[i])
-        centre = cavity * (mean / own - shift[i])
-        inside, variance = truncated(centre, jnp.sqrt(cavity), low[i], high[i])
-        site = 1 / variance - 1 / cavity, inside / variance - centre / cavity
-        return precision.at[i].set(site[0]), shift.at[i].set(site[1])
+    def sweep(sites: tuple[AnyArray, AnyArray]) -> tuple[AnyArray, AnyArray]:
+        for i in range(size):
+            precision, shift = sites
+            u, _, spread = posterior(precision, shift)
+            own, mean = spread[..., i, i], (both[..., i, :] * u).sum(-1)
+            cavity = 1 / (1 / own - precision[..., i])
+            centre = cavity * (mean / own - shift[..., i])
+            inside, variance = truncated(centre, xp.sqrt(cavity), low[..., i], high[..., i])
+            found = 1 / variance - 1 / cavity, inside / variance - centre / cavity
+            sites = _replaced(precision, i, found[0]), _replaced(shift, i, found[1])
+        return sites
 
-    def sweep(sites: tuple[Array, Array], _) -> tuple[tuple[Array, Array], None]:
-        return jax.lax.fori_loop(0, rows.size, one, sites), None
-
-    nothing = jnp.zeros(rows.size), jnp.zeros(rows.size)
-    count = 1 if rows.size == 1 else SWEEPS
-    (precision, shift), _ = jax.lax.scan(sweep, nothing, length=count)
+    sites = xp.zeros_like(low), xp.zeros_like(low)
+    precision, shift = _times(1 if size == 1 else SWEEPS, sweep, sites)
     u, gain, _ = posterior(precision, shift)
-    values = free + scale * (some @ u)
-    step = jnp.eye(free.size) - gain @ (precision[:, None] * jnp.eye(free.size)[rows])
-    sound = jnp.isfinite(values).all() & (values > 0).all()
+    found = values + scale * (some @ u[..., None])[..., 0]
+    step = every - (gain * precision[..., None, :]) @ every[rows]
+    sound = xp.isfinite(found).all(-1) & (found > 0).all(-1)
 
-    def scaled(matrix: Float[Array, "element element"]) -> Float[Array, "element element"]:
-        return jnp.where(sound, matrix * jnp.outer(scale, scale), jnp.nan)
+    def scaled(matrix: AnyArray) -> AnyArray:
+        return xp.where(sound[..., None, None], matrix * outer, np.nan)
 
-    limit = scipy.special.chdtri(rows.size, scipy.special.chdtrc(1, CONTRADICTED))
-    nearest = _nearest(some[rows], low, high)
+    limit = scipy.special.chdtri(size, scipy.special.chdtrc(1, CONTRADICTED))
+    nearest = _nearest(both, low, high)
+    outside = -xp.clip(xp.zeros_like(low), low, high) @ every[rows]
+    moved = (u * (both @ u[..., None])[..., 0]).sum(-1)
     return Within(
-        values=jnp.where(sound, values, jnp.nan),
+        values=xp.where(sound[..., None], found, np.nan),
         cov=scaled(step @ whole),
-        shared_cov=scaled(step @ (shared_cov / jnp.outer(scale, scale)) @ step.T),
-        outside=jnp.zeros_like(free).at[rows].set(-jnp.clip(0.0, low, high)),
+        shared_cov=scaled(step @ (shared_cov / outer) @ step.swapaxes(-1, -2)),
+        outside=outside,
         deviance=nearest,
-        contradicted=jnp.where(sound, u @ some[rows] @ u, nearest) > limit,
+        contradicted=xp.where(sound, moved, nearest) > limit,
     )
 
 
 def _nearest(
-    cov: Float[Array, "bound bound"], low: Float[Array, " bound"], high: Float[Array, " bound"]
-) -> Float[Array, ""]:
+    cov: Float[AnyArray, "*row bound bound"],
+    low: Float[AnyArray, "*row bound"],
+    high: Float[AnyArray, "*row bound"],
+) -> Float[AnyArray, "*row"]:
     """Squared distance [standard errors] from 0 to the nearest point between the bounds.
 
     Each element in turn moves to its best place; the others follow by their correlations.
     """
-    precision = jnp.linalg.inv(cov)
+    xp, precision = namespace(cov), inverse(cov)
 
-    def move(step: Array, x: Float[Array, " bound"]) -> Float[Array, " bound"]:
-        i = step % x.size
-        best = x[i] - precision[i] @ x / precision[i, i]
-        return x.at[i].set(jnp.clip(best, low[i], high[i]))
+    def sweep(x: AnyArray) -> AnyArray:
+        for i in range(low.shape[-1]):
+            pull = (precision[..., i, :] * x).sum(-1) / precision[..., i, i]
+            x = _replaced(x, i, xp.clip(x[..., i] - pull, low[..., i], high[..., i]))
+        return x
 
-    x = jax.lax.fori_loop(0, SWEEPS * low.size, move, jnp.clip(0.0, low, high))
-    return x @ precision @ x
+    x = _times(SWEEPS, sweep, xp.clip(xp.zeros_like(low), low, high))
+    return (x * (precision @ x[..., None])[..., 0]).sum(-1)
+
+
+def _times(count: int, step: Callable[[Any], Any], state: Any) -> Any:
+    """A step, again and again: a loop of Python for NumPy, one of JAX for JAX."""
+    if namespace(*jax.tree.leaves(state)) is np:
+        for _ in range(count):
+            state = step(state)
+        return state
+    return jax.lax.fori_loop(0, count, lambda _, state: step(state), state)
+
+
+def _replaced(of: AnyArray, place: int, by: AnyArray) -> AnyArray:
+    """An array with another value at one place of its last axis."""
+    return namespace(of).where(np.arange(of.shape[-1]) == place, by[..., None], of)
 
 
 def truncated(
-    mean: Float[Array, ""],
-    deviation: Float[Array, ""],
-    low: Float[Array, ""],
-    high: Float[Array, ""],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    mean: Float[AnyArray, "*row"],
+    deviation: Float[AnyArray, "*row"],
+    low: Float[AnyArray, "*row"],
+    high: Float[AnyArray, "*row"],
+) -> tuple[Float[AnyArray, "*row"], Float[AnyArray, "*row"]]:
     """Mean and variance of a normal distribution between two bounds.
 
     By quadrature around the most probable value: the closed form loses all digits far from the
     mean, and between bounds that are close to each other.
     """
+    xp = namespace(mean, deviation, low, high)
     a, b = (low - mean) / deviation, (high - mean) / deviation
-    mode = jnp.clip(0.0, a, b)
-    reach = TAIL / (jnp.sqrt(mode**2 + TAIL) + jnp.abs(mode))
-    left, right = -jnp.minimum(mode - a, reach), jnp.minimum(b - mode, reach)
-    t = (left + right) / 2 + (right - left) / 2 * NODES
-    weight = WEIGHTS * jnp.exp(-(t**2) / 2 - mode * t)
-    weight = weight / weight.sum()
-    centre = weight @ t
-    return mean + deviation * (mode + centre), deviation**2 * (weight @ (t - centre) ** 2)
+    mode = xp.clip(xp.zeros_like(a), a, b)
+    reach = TAIL / (xp.sqrt(mode**2 + TAIL) + xp.abs(mode))
+    left, right = -xp.minimum(mode - a, reach), xp.minimum(b - mode, reach)
+    t = ((left + right) / 2)[..., None] + ((right - left) / 2)[..., None] * NODES
+    weight = WEIGHTS * xp.exp(-(t**2) / 2 - mode[..., None] * t)
+    weight = weight / weight.sum(-1, keepdims=True)
+    centre = (weight * t).sum(-1)
+    spread = (weight * (t - centre[..., None]) ** 2).sum(-1)
+    return mean + deviation * (mode + centre), deviation**2 * spread
 
 
 def of_circuit(bounds: Limits, circuit: AbstractCircuit) -> Limits:
@@ -168,7 +198,7 @@ def of_circuit(bounds: Limits, circuit: AbstractCircuit) -> Limits:
 
 
 def limited(
-    circuit: AbstractCircuit, bounds: Limits, outside: Float[Array, " element"] | None = None
+    circuit: AbstractCircuit, bounds: Limits, outside: Float[AnyArray, " element"] | None = None
 ) -> Limited | None:
     """The bounds of the elements of a fit; None without bounds.
 

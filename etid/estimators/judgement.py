@@ -84,7 +84,7 @@ def judged(
     own, outside, contradicted = of_circuit(bounds, circuit), None, jnp.array(False)
     support = estimate.support
     if own:
-        found = within(fitted, cov, shared_cov, own)
+        found = within(circuit, values, cov, shared_cov, own)
         inside, cov, shared_cov, outside, deviance, contradicted = found
         if support is not None:  # bounds are a part of what a choice of circuits compares
             support = dataclasses.replace(support, deviance=support.deviance + deviance)

@@ -6,21 +6,17 @@ data, the data do not determine the parameters.
 """
 
 import dataclasses
-from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 from etid.circuits.branches import exchangeable, in_order
 from etid.circuits.circuit import AbstractCircuit, too_steep
-from etid.estimators.element_limits import Limits, Within, limited, of_circuit, within
+from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.element_prior import FIXED
 from etid.estimators.judgement import STRAINED, SUCCESSFUL, misses
-from etid.estimators.lanes import stacked, taken
 from etid.likelihood.fit import Estimate
 from etid.likelihood.linear import diagonal
-from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Limited
 from etid.results.verdicts import RESULTS, verdicts_of
@@ -56,8 +52,7 @@ def judged(
     cov, shared_cov = found.cov * outer, found.shared_cov * outer
     outside, contradicted = None, np.zeros(len(values), bool)
     if own:
-        of = circuit.of_fit(np.moveaxis(values, -1, 0)), cov, shared_cov
-        numbers = map(np.asarray, _inside(*of, own))
+        numbers = within(circuit, values, cov, shared_cov, own)
         inside, cov, shared_cov, outside, deviance, contradicted = numbers
         support = dataclasses.replace(support, deviance=support.deviance + deviance)
         errors = np.sqrt(diagonal(cov)) / inside
@@ -108,18 +103,6 @@ def judged(
         limits=_limits(circuit, own, outside, len(values)),
         by_tolerance=found.effects,
     )
-
-
-@program
-def _within(circuit: AbstractCircuit, cov: Any, shared_cov: Any, bounds: Limits) -> Within:
-    return within(circuit, cov, shared_cov, bounds)
-
-
-def _inside(circuit: AbstractCircuit, cov: Any, shared_cov: Any, bounds: Limits) -> Within:
-    """`within` of each row."""
-    rows = range(len(cov))
-    each = [_within(taken(circuit, row), cov[row], shared_cov[row], bounds) for row in rows]
-    return stacked(jax.device_get(each))
 
 
 def _limits(
