@@ -17,11 +17,9 @@ free, and the parameters of Z_th move within their covariance.
 import dataclasses
 from typing import Any
 
-import jax
 import numpy as np
 import scipy
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import serving
@@ -29,11 +27,10 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import fed
 from etid.likelihood.source_prior import delay_width
-from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
-from etid.results.driver import ContinuousDriver, Driver, SourceImpedance
+from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 
 CLEAR = 0.3  # relative standard error up to which the impedance of a band is drawn as a clear point
@@ -111,7 +108,7 @@ def bands(
 
     centre = np.exp(mean(weight * np.log(frequency)))
     off = mean(np.real(score)) + 1j * mean(np.imag(score))
-    z = np.asarray(circuit.response(jax.device_put(centre)))
+    z = np.asarray(circuit.response(centre))
     if z_th is None:
         impedance = z * (1 + off)
     else:
@@ -128,19 +125,6 @@ def bands(
     )
 
 
-@program
-def _source(
-    source: SourceImpedance, frequency: Float[Array, " harmonic"]
-) -> tuple[Complex[Array, " harmonic"], Complex[Array, "parameter harmonic"]]:
-    """Z_th and its derivatives with respect to its parameters."""
-    values, unflatten = ravel_pytree(source)
-
-    def z_th(p: Float[Array, " parameter"]) -> Complex[Array, " harmonic"]:
-        return unflatten(p).response(frequency)
-
-    return z_th(values), jax.jacfwd(z_th)(values).T
-
-
 def fitted(
     lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
 ) -> tuple[
@@ -152,12 +136,11 @@ def fitted(
 
     Z_th is None for a measured current. Its changes are in standard deviations.
     """
-    frequency = jax.device_put(lane.frequency)
-    z = np.asarray(circuit.response(frequency))
+    z = np.asarray(circuit.response(lane.frequency))
     turn = np.asarray(2 * np.pi * lane.frequency / lane.sample_rate)
     source, changes = None, np.zeros((0, z.size), complex)
     if not isinstance(feed, MeasuredCurrent):
-        source, slopes = map(np.asarray, _source(feed.source, frequency))
+        source, slopes = map(np.asarray, feed.source.with_slopes(lane.frequency))
         cov = np.asarray(feed.later_cov())
         if not np.isfinite(cov).all():  # a driver that failed is taken as it is
             cov = np.zeros_like(cov)

@@ -3,14 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
 
-from etid.circuits.circuit import AbstractCircuit
-from etid.numpy_tier.tiers import program
+from etid.circuits.circuit import with_slopes
 from etid.plotting import Impedance
 from etid.plotting.style import (
     COLOURS,
@@ -23,9 +20,9 @@ from etid.plotting.style import (
     titled,
     typeset,
 )
+from etid.precision import array_function
 from etid.results.driver import Driver
 from etid.results.fit import Fit
-from etid.solvers.matrices import log_stderr
 
 POINTS = 300
 
@@ -34,11 +31,11 @@ def draw_bode(canvas: Canvas, things: Mapping[str, Impedance]) -> np.ndarray:
     """Magnitude and phase of impedances (the paper's figure 9), with bands."""
     magnitude, phase = axes = canvas(2, 1, (6.0, 5.0), sharex=True).ravel()
     # From the paper's pulse rate to half its sample rate.
-    frequency = jax.device_put(np.geomspace(60.0, 100e3, POINTS))
-    kilohertz = np.asarray(frequency) / 1e3
+    frequency = np.geomspace(60.0, 100e3, POINTS)
+    kilohertz = frequency / 1e3
     sizes, banded, failed = [], False, []
     for i, (label, thing) in enumerate(things.items()):
-        z, errors = map(np.asarray, _with_errors(thing, frequency))
+        z, errors = _with_errors(thing, frequency)
         known = np.isfinite(errors).all()
         look = {"color": nth(COLOURS, i), "linestyle": nth(DASHES, i), "lw": 1.3}
         if isinstance(thing, Fit | Driver):
@@ -65,12 +62,12 @@ def draw_bode(canvas: Canvas, things: Mapping[str, Impedance]) -> np.ndarray:
 def curve(
     magnitude: Axes,
     phase: Axes,
-    frequency: Float[Array | np.ndarray, " frequency"],
+    frequency: Float[np.ndarray, " frequency"],
     z: Complex[np.ndarray, " frequency"],
     **look: Any,
 ) -> None:
     """Draw an impedance [Ω] over frequency [Hz], in kΩ and degrees over kHz."""
-    kilohertz = np.asarray(frequency) / 1e3
+    kilohertz = frequency / 1e3
     magnitude.plot(kilohertz, np.abs(z) / 1e3, **look)
     phase.plot(kilohertz, np.degrees(np.unwrap(np.angle(z))), **look)
 
@@ -107,28 +104,27 @@ def frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> N
 
 
 def _with_errors(
-    thing: Impedance, frequency: Float[Array, " frequency"]
-) -> tuple[Complex[Array | np.ndarray, " frequency"], Float[Array | np.ndarray, "2 frequency"]]:
+    thing: Impedance, frequency: Float[np.ndarray, " frequency"]
+) -> tuple[Complex[np.ndarray, " frequency"], Float[np.ndarray, "2 frequency"]]:
     """Z, and standard errors of ln |Z| and of the phase [rad]; NaN without a covariance."""
     if isinstance(thing, Fit):
-        errors = _of_circuit(thing.circuit, jax.device_put(thing.cov), frequency)
-        return thing.circuit.response(frequency), errors
+        return _of_circuit(thing, frequency)
     if isinstance(thing, Driver):
-        return thing.response(frequency), thing.log_response_stderr(frequency)
-    return thing.response(frequency), np.full((2, frequency.size), np.nan)
+        errors = np.asarray(thing.log_response_stderr(frequency))
+        return np.asarray(thing.response(frequency)), errors
+    return np.asarray(thing.response(frequency)), np.full((2, frequency.size), np.nan)
 
 
-@program
+@array_function
 def _of_circuit(
-    circuit: AbstractCircuit,
-    cov: Float[Array, "parameter parameter"],
-    frequency: Float[Array, " frequency"],
-) -> Float[Array, "2 frequency"]:
-    """Standard errors of ln |Z| and of the phase, from the covariance of the elements."""
-    kind, names = type(circuit), circuit.names()
+    fit: Fit, frequency: Float[np.ndarray, " frequency"]
+) -> tuple[Complex[np.ndarray, " frequency"], Float[np.ndarray, "2 frequency"]]:
+    """Z, and standard errors of ln |Z| and of the phase [rad], from the covariance of a fit.
 
-    def response(values: Float[Array, " parameter"]) -> Complex[Array, " frequency"]:
-        circuit = kind(**{name: values[i] for i, name in enumerate(names)})
-        return jnp.asarray(circuit.response(frequency))
-
-    return log_stderr(response, jnp.asarray(circuit.values()), cov)
+    var = J cov Jᵀ,    J = ∂(ln |Z|, arg Z) / ∂ ln element
+    """
+    values, logs = np.asarray(fit.circuit.values()), np.asarray(fit.circuit.log_values())
+    cov = np.asarray(fit.cov) / np.outer(values, values)
+    z, slopes = with_slopes(fit.circuit, logs, frequency)
+    parts = np.stack([(slopes / z).real, (slopes / z).imag])
+    return z, np.sqrt((parts * (cov @ parts)).sum(1))

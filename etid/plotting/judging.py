@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
@@ -79,7 +78,7 @@ def _diagrams(
     size = None if stderr is None else 2 * stderr * np.abs(z) / 1e3
     if fit is not None:
         smooth = np.geomspace(frequency.min() / 1.3, frequency.max() * 1.3, POINTS)
-        fitted = np.asarray(fit.circuit.response(jnp.asarray(smooth)))
+        fitted = np.asarray(fit.circuit.response(np.asarray(smooth)))
         line: Any = {"color": ORANGE, "lw": 1.3, "label": "fit"}
         nyquist.plot(np.real(fitted) / 1e3, -np.imag(fitted) / 1e3, **line)
         curve(magnitude, phase, smooth, fitted, **line)
@@ -185,7 +184,7 @@ def _measured_and_fitted(
     ):
         of = measured.frequency[some], measured.z[some], measured.stderr[some]
         points(magnitude, phase, *of, label=label, alpha=alpha, **look)
-    frequency = jnp.geomspace(measured.frequency[0], measured.frequency[-1], POINTS)
+    frequency = np.geomspace(measured.frequency[0], measured.frequency[-1], POINTS)
     sizes = [np.abs(measured.z[clear]) / 1e3]
     for number, one in enumerate(fitted):
         label = f"{one.name}, chosen"

@@ -13,29 +13,30 @@ import os
 from collections.abc import Mapping, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.display import per_cent, rounded, several
 from etid.circuits.overview import Overview, Overviewed
+from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import given_driver
-from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.maximum_likelihood.load_fit import inverse_information
-from etid.estimators.maximum_likelihood.profile import Records
+from etid.estimators.maximum_likelihood.rows import loads_of, source_of
 from etid.identify.arguments import check_new
 from etid.identify.driver import identify_driver, with_harmonics
 from etid.identify.skins import identify_skin
 from etid.likelihood.calibrations import Calibrations
+from etid.likelihood.linear import diagonal, inverse
+from etid.likelihood.search import Near
 from etid.likelihood.source_prior import delay_std
-from etid.numpy_tier.tiers import program
-from etid.precision import in_float64
+from etid.numpy_tier.algebra import one_thread
+from etid.precision import array_function, in_float64
 from etid.recordings.hdf5 import read_calibrations
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import Calibration, ContinuousDriver, Driver, HarmonicDriver, Order
+from etid.signals.harmonics import signal_share
 from etid.signals.transfer import as_complex
 from etid.simulation.published import TYPICAL
 from etid.solvers.matrices import inverse_root
@@ -208,56 +209,62 @@ def expected_errors(
     Returns:
         Relative standard errors of the elements, by name.
     """
-    resistors = jnp.array([] if further is None else [further])
-    errors = _bound(driver, resistors, jnp.array(periods), jax.tree.map(jnp.asarray, circuit))
-    return dict(zip(circuit.names(), np.asarray(errors).tolist(), strict=True))
+    errors = _bound(driver, np.array([] if further is None else [further]), periods, circuit)
+    return dict(zip(circuit.names(), errors.tolist(), strict=True))
 
 
-@program
+@one_thread()
+@array_function
 def _bound(
     driver: HarmonicDriver,
-    further: Float[Array, " resistor"],
-    periods: Float[Array, ""],
+    further: Float[np.ndarray, " resistor"],
+    periods: float,
     circuit: AbstractCircuit,
-) -> Float[Array, " element"]:
+) -> Float[np.ndarray, " element"]:
     """Bound of the standard errors of the logarithms of the elements: H⁻¹ without any noise."""
-    now = Calibrations.of(driver)
+    now = jax.tree.map(np.asarray, Calibrations.of(driver))
     model = _as_recorded(now, further, periods)
     common = model.start()
     linear = model.linear(model.near(common))
     # The width of the prior of Z_th is that of the known resistors as they are now.
     source, (_, weak) = slice(driver.cov.shape[0]), now.weak(now.start())
-    prior = linear.precision.at[source, source].set((weak @ weak.T)[source, source])
+    prior = np.array(linear.precision)
+    prior[source, source] = (weak @ weak.T)[source, source]
     information = linear.told(linear.jacobian) + prior
-    later = driver.drift_std()
-    later = jnp.pad(jnp.diag(later), ((0, common.size - later.size), (0, 0)))
-    directions = jnp.concatenate([inverse_root(information), later], axis=1)
-    first = jax.tree.map(lambda leaf: leaf[0], model.spectra)
-    count = directions.shape[1]
-    known = jnp.zeros(count), jnp.eye(count)
+    later = np.diag(np.asarray(driver.drift_std()))
+    later = np.pad(later, ((0, common.size - len(later)), (0, 0)))
+    directions = np.concatenate([inverse_root(information), later], axis=1)
+    first, count = jax.tree.map(lambda leaf: leaf[0], model.spectra), directions.shape[1]
+    known = np.zeros(count), np.eye(count)
     given = given_driver.around(model, common, directions, first.frequency, False, *known)
-    load = Load.behind(given, circuit, Records.of(first), model.rate)
-    unknown = jnp.zeros(load.gains.outputs + count)  # the delay and z
-    q = jnp.concatenate([circuit.log_values(), unknown])
-    records = dataclasses.replace(load.records, y=load.gains(q) * first.x[None])
-    load = dataclasses.replace(load, records=records)
-    variance = jnp.diagonal(inverse_information(load, load.near(q)))
-    return jnp.sqrt(variance[: load.gains.elements])
+    fields = first.x, first.y, first.variance_x, first.variance_y, first.selected
+    lane = Harmonics(first.frequency, *fields, model.rate)
+    load = loads_of([lane], source_of(given), circuit, None, None)
+    unknown = np.zeros(load.gains.outputs.count + count)  # the delay and z
+    q = np.concatenate([circuit.log_values(), unknown])[None]
+    y = load.gains(q) * load.records.x[:, None]
+    load = dataclasses.replace(load, records=load.records._replace(y=y))
+    near = Near.of(load, load.gains.at(load.knots.index), q)
+    share = signal_share(near.profile.x, load.records.variance_x)[:, None, None]
+    share = near.condensed.means([near.profile], load.knots, share)
+    expected = (near.jacobian * share) @ near.jacobian.swapaxes(-1, -2)
+    variance = diagonal(inverse(expected + np.diag(1 / load.width**2)))[0]
+    return np.sqrt(variance[: load.gains.elements])
 
 
 def _as_recorded(
-    model: Calibrations, further: Float[Array, " resistor"], periods: Float[Array, ""]
+    model: Calibrations, further: Float[np.ndarray, " resistor"], periods: float
 ) -> Calibrations:
     """Calibrations without noise in V_out, with further ones and times as many periods."""
     of, spectra = model.calibration, model.spectra
-    more = jax.tree.map(lambda leaf: jnp.repeat(leaf[:1], further.size, axis=0), spectra)
+    more = jax.tree.map(lambda leaf: np.repeat(leaf[:1], further.size, axis=0), spectra)
     # Another unloaded record with the same power, on which alone the information depends.
-    more = dataclasses.replace(more, x=as_complex(jnp.abs(more.x)))
-    spectra = jax.tree.map(lambda *both: jnp.concatenate(both), spectra, more)
+    more = dataclasses.replace(more, x=as_complex(np.abs(more.x)))
+    spectra = jax.tree.map(lambda *both: np.concatenate(both), spectra, more)
     variances = spectra.variance_x / periods, spectra.variance_y / periods
     spectra = dataclasses.replace(spectra, variance_x=variances[0], variance_y=variances[1])
-    r_load = jnp.concatenate([of.r_load, further])
-    delays = jnp.concatenate([of.delay_samples, jnp.zeros_like(further)])
+    r_load = np.concatenate([of.r_load, further])
+    delays = np.concatenate([of.delay_samples, np.zeros_like(further)])
     of = Calibration(r_load, delays, delay_std(r_load))
     model = dataclasses.replace(model, calibration=of, spectra=spectra)
     y = model.gains(model.start()) * spectra.x

@@ -1,15 +1,13 @@
-"""Inverses and roots of symmetric matrices, each scaled to a unit diagonal, and errors from them.
+"""Inverses and roots of symmetric matrices, each scaled to a unit diagonal.
 
 The parameters of a fit have different units, or very different accuracies. Inverses and roots
 therefore scale their matrix M before it is factorised: D⁻¹ M D⁻¹, where D² is the diagonal of M.
 """
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from etid.precision import namespace
 from etid.signals.transfer import AnyArray
@@ -85,26 +83,6 @@ def is_definite(cov: Float[np.ndarray, "n n"]) -> bool:
 def diagonal(matrix: Float[AnyArray, "n n"]) -> Float[AnyArray, " n"]:
     """The diagonal of a matrix; `jnp.diagonal` is traced as twenty operations."""
     return namespace(matrix).where(np.eye(matrix.shape[0], dtype=bool), matrix, 0.0).sum(1)
-
-
-def log_stderr(
-    response: Callable[[Float[Array, " parameter"]], Complex[Array, " frequency"]],
-    values: Float[Array, " parameter"],
-    cov: Float[Array, "parameter parameter"],
-) -> Float[Array, "2 frequency"]:
-    """Standard errors of ln |Z| and of the phase [rad], to first order.
-
-    var = J cov Jᵀ,    J = ∂(ln |Z|, arg Z) / ∂parameters
-
-    `response` is the impedance at all frequencies [Ω], `cov` the covariance of the parameters.
-    """
-
-    def parts(p: Float[Array, " parameter"]) -> Float[Array, "2 frequency"]:
-        log_z = jnp.log(response(p))
-        return jnp.stack([log_z.real, log_z.imag])
-
-    slope = jax.jacfwd(parts)(values)
-    return jnp.sqrt(jnp.einsum("cfi,ij,cfj->cf", slope, cov, slope))
 
 
 def _unit_diagonal(

@@ -37,8 +37,11 @@ def source_of(known: GivenDriver) -> Source:
     if of is not None:
         stated = np.asarray((of.told or Instrument()).budgeted())
         errors = Errors(of.at, of.by_z, of.unstated, of.direct, of.drift, stated)
-    if known.faults is not None and of is not None:
-        tolerances = Tolerances(*known.faults, known.bend, of.at[-1], of.by_z[:, -1])
+    if known.faults is not None:
+        bending = np.zeros(()), np.zeros(known.mean.size)
+        if of is not None:
+            bending = of.at[-1], of.by_z[:, -1]
+        tolerances = Tolerances(*known.faults, known.bend, *bending)
     loaded = None if known.by_current else known.loaded
     numbers = known.w_slope, known.slope, known.resistance, known.mean, known.cov
     return Source(known.frequency, loaded, *numbers, known.delay_width, tolerances, errors)
