@@ -74,7 +74,7 @@ def test_the_standard_error_of_the_charge_is_what_other_calibrations_and_noise_m
     """Noise: the derivative. Calibration: Z_th along z, with the gain of the pulses fixed."""
     controller, _ = controlled()
     model, circuit = controller.model, etid.SkinRC(*dataclasses.astuple(DRY))
-    logs, step = circuit.log_values(), 1e-5
+    logs, step = jnp.asarray(circuit.log_values()), 1e-5
     nothing = jnp.zeros((3, 3))
     alone = dataclasses.replace(model, source_error=0 * model.source_error)
     current = eqx.filter_jit(alone.current)

@@ -303,7 +303,8 @@ class Tracker(Overviewed, Kept):
     def clock(self) -> Clock:
         """A clock for the pulses of one stream."""
         model = self.model
-        gain = np.asarray(_undelayed(model, model.circuit.log_values()))
+        logs = jax.device_put(model.circuit.log_values())
+        gain = np.asarray(_undelayed(model, logs))
         return Clock(self.period, model.bands.waveform(gain))
 
     @in_float64
