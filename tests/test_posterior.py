@@ -11,7 +11,8 @@ import pytest
 
 import etid
 from benchmarks.ladder import LOADS
-from etid.identify.posterior import Impedances, inside, stretched
+from etid.identify.posterior import Impedances, Minimum, given, inside, stretched
+from etid.precision import array_function
 from etid.results.posterior import Profile
 from etid.solvers.importance_sampling import drawn, effective
 
@@ -49,6 +50,16 @@ def test_at_60_db_the_draws_have_the_errors_of_the_fit(clear, posterior):
     assert np.abs((mean - np.log(values)) / errors).max() < 0.15
     np.testing.assert_allclose(np.sqrt(np.diag(cov)), errors, rtol=0.1)
     assert np.abs(cov / np.outer(errors, errors) - fit.correlation).max() < 0.15
+
+
+def test_the_curvature_of_the_likelihood_is_that_of_jax(clear):
+    fit, *_ = clear
+    lane, known, _ = given(fit, None, None)
+    load, q, cov = Minimum.of(lane, known, fit.circuit)
+    curvature = jax.jit(jax.hessian(array_function(lambda q: load.objective(q[None])[0])))(q)
+    root = np.linalg.cholesky(cov)
+    # By differences of steps of 3e-3 standard errors, with the rounding errors of F.
+    np.testing.assert_allclose(root.T @ np.asarray(curvature) @ root, np.eye(q.size), atol=1e-4)
 
 
 def test_what_bounds_tell_of_the_elements_moves_the_others_as_their_covariance_says(clear):

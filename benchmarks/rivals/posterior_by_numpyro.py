@@ -26,14 +26,14 @@ WARM_UP = 500
 ACCEPTED = 0.9  # of the proposals
 
 
-def drawn_by_nuts(pieces, mean, cov, seed):
+def drawn_by_nuts(least, powers, seed):
     """Draws of q, in coordinates in which Laplace's approximation is a standard normal."""
-    terms = posterior.terms_of(*pieces)
-    root, powers = jnp.linalg.cholesky(cov), posterior.Impedances.of_circuit(pieces[2], mean).powers
+    load, mean, cov = least
+    root = jnp.linalg.cholesky(cov)
 
     def potential(u):
         q = mean + root @ u
-        return posterior.cost(terms, q) - powers @ q  # the prior is uniform in the impedances
+        return load.objective(q[None])[0] - powers @ q  # the prior is uniform in the impedances
 
     kernel = NUTS(
         potential_fn=potential,
@@ -51,16 +51,15 @@ def compared(snr_db, seed):
     fit = etid.identify_skin(study["typical/dry/01"], driver, throw=False)
     if fit.verdict != "successful":
         return None
-    fit.posterior()  # compiles
+    fit.posterior()  # imports
     started = time.perf_counter()
     ours = fit.posterior(draws=DRAWS)
     between = time.perf_counter()
     lane, known, wanted = posterior.given(fit, None, None)
-    pieces = lane, known, fit.circuit
-    mean, cov = map(np.asarray, posterior.minimum(*pieces))
-    impedances = posterior.Impedances.of_circuit(fit.circuit, mean)
-    x = np.stack([impedances.of(q) for q in drawn_by_nuts(pieces, mean, cov, seed)])
-    (at, own), (_, wanted) = (impedances.moments(mean, of) for of in (cov, wanted))
+    least = posterior.Minimum.of(lane, known, fit.circuit)
+    impedances = posterior.Impedances.of_circuit(fit.circuit, least.q)
+    x = np.stack([impedances.of(q) for q in drawn_by_nuts(least, impedances.powers, seed)])
+    (at, own), (_, wanted) = (impedances.moments(least.q, of) for of in (least.cov, wanted))
     theirs = impedances.logs(posterior.stretched(x, at, own, wanted))
     ended = time.perf_counter()
     logs = np.log(np.asarray(ours.draws.values()))
