@@ -1,73 +1,48 @@
 """Standard errors of loads that share an unloaded record, against all parameters at once."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from etid.estimators.joint import errors
-from etid.estimators.joint.terms import Loads
-from etid.estimators.unknowns import LoadUnknowns
-from etid.likelihood.sandwich import Curvature, Linear
-from etid.signals.harmonics import Spectrum
+from etid.likelihood.joint.errors import AtMinimum, Eliminated, by_noise, correlated
 
 COMMON, OWN, ROWS, NOISE = 2, 3, 12, 4  # parameters, terms of a load, numbers of a record's noise
 
 
-def loads_with(unloaded, used):
-    def repeated(one):
-        return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(unloaded)), one)
-
-    line, wave = jnp.ones(5), jnp.ones(5, complex)
-    return Loads(
-        spectrum=repeated(Spectrum(line, wave, wave, line, line, line > 0)),
-        sample_rate=jnp.ones(len(unloaded)),
-        own=repeated(LoadUnknowns(jnp.zeros(OWN - 1), jnp.zeros(()))),
-        errors=jnp.zeros((len(unloaded), 0)),
-        used=jnp.array(used),
-        unloaded=jnp.array(unloaded),
-    )
-
-
 def test_what_loads_with_one_record_have_in_common_adds_to_the_score_of_the_driver():
-    """Σ_i Σ_j≠i m_iᵀ m_j: a load alone adds nothing, and loads that take no part do not either."""
-    m = np.random.default_rng(0).standard_normal((6, NOISE, COMMON))
-    loads = loads_with([0, 1, 0, -1, 0, -1], [True, True, True, True, False, True])
-    added = errors._correlated(loads, errors._ByX(jnp.asarray(m), jnp.zeros((6, NOISE, OWN))), 2)
+    """Σ_i Σ_j≠i m_iᵀ m_j over loads with one record: a load alone adds nothing."""
+    m = np.random.default_rng(0).standard_normal((4, NOISE, COMMON))
+    added = correlated(m, np.array([0, 1, 0, 2]))
     np.testing.assert_allclose(added, m[0].T @ m[2] + m[2].T @ m[0], atol=1e-12)
 
 
 def test_the_covariance_of_the_driver_is_that_of_all_parameters_at_once():
     """H⁻¹ Jᵀ C J H⁻¹ of three loads whose terms have unit noise each, two with one record."""
-    draws, unloaded = np.random.default_rng(1), (0, 0, -1)
+    draws, unloaded = np.random.default_rng(1), np.array([0, 0, -1])
     whole = np.zeros((3 * ROWS, COMMON + 3 * OWN))
-    noise, parts = np.zeros((3 * ROWS, NOISE)), []
+    noise, parts, of_x = np.zeros((3 * ROWS, NOISE)), [], []
     for i in range(3):
         at, own = slice(i * ROWS, (i + 1) * ROWS), COMMON + i * OWN
-        part = draws.standard_normal((ROWS, COMMON + OWN))
-        of_x = 0.3 * draws.standard_normal((ROWS, NOISE))
-        whole[at, :COMMON], whole[at, own : own + OWN] = part[:, :COMMON], part[:, COMMON:]
-        noise[at] = of_x if unloaded[i] == 0 else 0.0
-        parts.append((part, of_x))
-    covariance = noise @ noise.T
+        part = draws.standard_normal((ROWS, OWN + COMMON))
+        whole[at, :COMMON], whole[at, own : own + OWN] = part[:, OWN:], part[:, :OWN]
+        parts.append(part)
+        of_x.append(0.3 * draws.standard_normal((ROWS, NOISE)))
+        noise[at] = of_x[-1] if unloaded[i] == 0 else 0.0
+    score = noise @ noise.T
     for i in range(3):
         at = slice(i * ROWS, (i + 1) * ROWS)
-        covariance[at, at] = np.eye(ROWS)
+        score[at, at] = np.eye(ROWS)
     inverse = np.linalg.inv(whole.T @ whole)
-    expected = (inverse @ whole.T @ covariance @ whole @ inverse)[:COMMON, :COMMON]
+    expected = (inverse @ whole.T @ score @ whole @ inverse)[:COMMON, :COMMON]
 
-    rests, by_x = [], []
-    for part, of_x in parts:
-        of = Curvature(jnp.asarray(part.T @ part), jnp.asarray(part.T @ part))
-        bread = jnp.linalg.inv(of.expected[COMMON:, COMMON:])
-        slope = -bread @ of.expected[COMMON:, :COMMON]
-        one = errors._Eliminated(of.eliminate(COMMON), bread, slope, bread)
-        rests.append(one.rest)
-        by_x.append(errors._influence(jnp.asarray(of_x.T @ part), one))
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *by_x)
-    more = errors._correlated(loads_with(unloaded, [True] * 3), stacked, 1)
-    bread = jnp.linalg.inv(sum(of.expected for of in rests))
-    found = bread @ (sum(of.score for of in rests) + more) @ bread
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    jacobian, ones = np.stack(parts).swapaxes(1, 2), np.ones((3, ROWS))
+    by_x = np.stack([of.T @ part for of, part in zip(of_x, parts, strict=True)])
+    none = np.zeros((3, OWN + COMMON))
+    at = AtMinimum(np.ones(3), np.ones(3), jacobian, ones, ones, 0 * ones, none, {}, by_x)
+    found = Eliminated.of(at, OWN)
+    bread, both = np.linalg.inv(found.rest.sum(0)), unloaded >= 0
+    more = correlated(found.x_by_common[both], unloaded[both])
+    np.testing.assert_allclose(
+        bread @ (found.score.sum(0) + more) @ bread, expected, rtol=1e-9, atol=1e-12
+    )
 
 
 def test_noise_of_an_unloaded_record_moves_the_gradient_as_the_gains_bring_it_into_the_terms():
@@ -81,6 +56,5 @@ def test_noise_of_an_unloaded_record_moves_the_gradient_as_the_gains_bring_it_in
         for x in range(size):
             noise = unit * gains * (np.arange(size) == x)
             expected.append(jacobian @ np.concatenate([noise.real.ravel(), noise.imag.ravel()]))
-    ones = jnp.ones(2 * outputs * size)
-    found = errors._by_noise(Linear(jnp.asarray(jacobian), ones, ones), jnp.asarray(gains))
+    [found] = by_noise(jacobian[None], gains[None])
     np.testing.assert_allclose(found, expected, rtol=1e-12)

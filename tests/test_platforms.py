@@ -65,10 +65,3 @@ def test_a_batch_is_lowered_for_cuda(lowered, study, drivers, method, monkeypatc
     driver = drivers[DRIVERS[method]]
     with lowered("_chunk"):
         etid.identify_skins(study.loaded, driver, method=method)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("program", ["_alone", "_together"])
-def test_a_joint_fit_is_lowered_for_cuda(lowered, study, program):
-    with lowered(program):
-        etid.identify_jointly(study)

@@ -22,7 +22,7 @@ SHOWN = (
 )
 # Tables whose numbers depend on them; those of no other do.
 ONLY = {
-    ("identify/jointly.py", "selection/delays.py", "estimators/joint"): ("coverage", "tolerances"),
+    ("identify/jointly.py", "selection/delays.py", "likelihood/joint"): ("coverage", "tolerances"),
     ("online",): ("control", "live", "mutation", "online"),
 }
 

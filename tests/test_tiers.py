@@ -365,17 +365,3 @@ def test_drawn_recordings_by_all_methods_and_circuits_are_those_of_xla(options, 
                 return etid.identify_skin(loaded, driver, throw=False, **options)
 
             same_fit(skin(), by_xla(skin))
-
-
-@pytest.mark.slow
-def test_joint_fits_are_those_of_xla(studies, by_xla):
-    for study in (studies["dry", 60.0], studies["damp", 60.0]):
-        by_numpy = etid.identify_jointly(study).fits
-        compiled = by_xla(lambda study=study: etid.identify_jointly(study)).fits
-        np.testing.assert_array_equal(by_numpy.verdicts, compiled.verdicts)
-        np.testing.assert_array_equal(by_numpy.fit.remarks, compiled.fit.remarks)
-        good = by_numpy.verdicts == "successful"
-        assert good.any()
-        one, other = (np.asarray(of.circuit.values())[good] for of in (by_numpy, compiled))
-        errors = np.asarray(compiled.stderr.values())[good]
-        assert (abs(one - other) <= OF_ERRORS * errors).all()

@@ -9,45 +9,30 @@ import contextlib
 import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Float
 from tqdm import tqdm
 
-from etid.estimators import judgement
+from etid.estimators.element_limits import of_circuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
-from etid.estimators.joint.errors import Delay, Found
-from etid.estimators.joint.fit import fit_alone, fit_together
-from etid.estimators.joint.terms import Joint, Loads
-from etid.estimators.lanes import (
-    AbstractLane,
-    Harmonics,
-    HarmonicsWithCurrent,
-    Lags,
-    replaced,
-    stacked,
-    taken,
-    unstacked,
-)
-from etid.estimators.maximum_likelihood import given_driver
+from etid.estimators.judgement import STRAINED, misses
+from etid.estimators.lanes import AbstractLane, Harmonics, Lags, replaced, stacked, taken, unstacked
 from etid.estimators.maximum_likelihood.estimator import description
-from etid.estimators.registry import register_description
+from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
+from etid.estimators.maximum_likelihood.verdict import judged
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
-from etid.estimators.score_tests.unloaded import shape_of
 from etid.identify.arguments import check_new, require
 from etid.identify.fitting import (
     Batch,
     Prepared,
     checksum,
     concluded,
-    each,
-    filled,
+    known_of,
     notes_of,
     refitted,
     remarks_on,
@@ -63,8 +48,16 @@ from etid.identify.options import (
 from etid.identify.planning import Refusal, batches, failed_fit
 from etid.identify.study import Drivers, common_first, fields_of, table
 from etid.likelihood.calibrations import Calibrations
-from etid.numpy_tier.tiers import program, worth_compiling
-from etid.precision import in_float64
+from etid.likelihood.fit import Estimate
+from etid.likelihood.fit import fit as fit_alone
+from etid.likelihood.joint.fit import Delays, Found, start_of
+from etid.likelihood.joint.fit import fit as fit_together
+from etid.likelihood.joint.loads import Loads
+from etid.likelihood.search import ROWS
+from etid.likelihood.starts import starts as starts_of
+from etid.likelihood.unloaded import differs
+from etid.numpy_tier.algebra import one_thread
+from etid.precision import array_function, in_float64, untraced
 from etid.recordings.errors import RecordingError
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
@@ -72,10 +65,12 @@ from etid.recordings.study import Study
 from etid.results.driver import HarmonicDriver, Order
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
-from etid.results.instrument import LATER, Effects, Instrument
+from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
-from etid.results.verdicts import RESULTS, verdict, verdicts_of
+from etid.results.verdicts import verdict, verdicts_of
 from etid.selection.delays import upper_limit
+from etid.signals.harmonics import same_unloaded
+from etid.signals.transfer import AnyArray
 
 METHOD = "joint"
 NOT_PERIODIC = Refusal(
@@ -99,93 +94,35 @@ register_description(
 
 
 class _Start(NamedTuple):
-    """Loads identified one by one (`fit_alone`); a joint fit starts from them.
+    """A load identified alone; a joint fit starts from it.
 
     Attributes:
-        loads: The loads.
-        hum: Whether each recording shows mains hum.
-        changed: Whether each recording shows that the driver has changed since its calibration.
-        other: Whether each recording shows another circuit or gain.
+        lane: Its harmonics.
+        logs: Logarithms of its elements.
+        delays: Delays of its outputs [samples].
+        errors: Errors of the instrument that it shows [their standard deviations].
+        used: Whether it takes part in the joint fit.
+        hum: Whether the recording shows mains hum.
+        falls: Whether a resistance that falls with its current explains most of what it misses.
+        changed: Whether the recording shows that the driver has changed since its calibration.
+        other: Whether the recording shows another circuit or gain.
     """
 
-    loads: Loads
-    hum: Bool[Array | np.ndarray, "*lane"]
-    changed: Bool[Array | np.ndarray, "*lane"]
-    other: Bool[Array | np.ndarray, "*lane"]
-
-
-def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
-    frequency = jnp.asarray(lanes.frequency)[0]
-    known = shape_of(driver, frequency)
-    given = uncertain = given_driver.given(driver, frequency, model.shared)
-    if not isinstance(lanes, HarmonicsWithCurrent) and driver.instrument is None:
-        given = model.around(model.calibrations.start(), frequency, slopes=False)
-
-    def one(lane: Harmonics) -> _Start:
-        spectrum, sample_rate = lane.spectrum, jnp.asarray(lane.sample_rate)
-        starts = given.starts(spectrum, sample_rate, model.circuit)
-        current = None
-        if isinstance(lane, HarmonicsWithCurrent):
-            current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
-        found = fit_alone(model, given, uncertain, spectrum, sample_rate, starts, current)
-        settled = found.result == optx.RESULTS.successful
-        good = settled & jnp.isfinite(found.chi2) & ~judgement.misses(found.chi2, found.rrse)
-        changed = jnp.array(False) if known is None else known.differs(spectrum)
-        used = good & ~changed & ~found.other
-        of = found.own, found.errors
-        loads = Loads(spectrum, sample_rate, *of, used, jnp.array(-1), current)
-        return _Start(loads, found.hum, changed, found.other)
-
-    return each(one, lanes, count)
-
-
-def _together(
-    model: Joint, groups: list[Loads], several: tuple[int, ...], driver: HarmonicDriver
-) -> tuple[list[Fit], HarmonicDriver, list[Delay], Float[Array, "common common"]]:
-    common, cov, found = fit_together(model, groups, several)
-
-    def fit(found: Found) -> Fit:
-        of_model = METHOD, model.bounds, model.prior
-        estimate, told, of = found.estimate, driver.instrument, model.calibrations
-        if told is not None:
-            # The search has the errors that nobody stated with a size that no recording changes.
-            sizes = told.complete().deviations(of.calibration.r_load.size) / of.tolerances
-            moved = found.by_error.T * sizes[:, None]
-            later = jnp.full((len(LATER), moved.shape[-1]), jnp.nan)  # nothing changes between them
-            effects = Effects.of_errors(moved, later, told.budgeted())
-            estimate = dataclasses.replace(estimate, by_tolerance=effects)
-        fit = judgement.judged(estimate, model.circuit, driver.result, *of_model)
-        fit = judgement.unless(fit, found.scale, RESULTS.inconsistent)
-        return judgement.unless(fit, found.other, RESULTS.misfit)
-
-    kept = model.calibrations.parameters(common).size
-    better = eqx.tree_at(
-        lambda d: (d.source, d.cov, d.calibration.delay_samples, d.result),
-        driver,
-        (
-            model.calibrations.source_of(common),
-            cov[:kept, :kept],
-            model.calibrations.delays(common),
-            RESULTS.where(
-                found[0].estimate.strain[0] > judgement.STRAINED,
-                RESULTS.inconsistent,
-                driver.result,
-            ),
-        ),
-    )
-    fits = [jax.vmap(fit)(of_group) for of_group in found]
-    return fits, better, [of.delay for of in found], cov
-
-
-# By whether they are compiled.
-_ALONE = {batch: program(_alone, batch=batch) for batch in (False, True)}
-_TOGETHER = {batch: program(_together, batch=batch) for batch in (False, True)}
+    lane: Harmonics
+    logs: Float[np.ndarray, " element"]
+    delays: Float[np.ndarray, " output"]
+    errors: Float[np.ndarray, " error"]
+    used: bool
+    hum: bool
+    falls: bool
+    changed: bool
+    other: bool
 
 
 def _narrower(
     groups: Sequence[Loads],
     fits: Sequence[Fit],
-    delays: Sequence[Delay],
+    delays: Sequence[Delays],
     cov: Float[np.ndarray, "common common"],
     rate: float,
     widest: float,
@@ -201,10 +138,10 @@ def _narrower(
         widest: Width of the prior in these fits [samples].
     """
     good = np.concatenate([fit.verdict == "successful" for fit in fits])
-    if good.sum() < 2 or any(np.any(np.asarray(loads.sample_rate) != rate) for loads in groups):
+    if good.sum() < 2 or any(loads.load.gains.sample_rate != rate for loads in groups):
         return None
     late, own, slope = (
-        np.concatenate([np.asarray(getattr(of, name)) for of in delays])[good]
+        np.concatenate([getattr(of, name) for of in delays])[good]
         for name in ("samples", "own_variance", "slope")
     )
     width = upper_limit(late, own, slope, cov, widest)
@@ -220,12 +157,12 @@ def _key(one: Prepared) -> tuple[Any, ...]:
 class _Group:
     """Recordings of one driver with the same number of harmonics, fitted by one estimator."""
 
-    def __init__(self, options: Options, like: Prepared, total: int) -> None:
-        self.total = total  # recordings of the study
+    def __init__(self, options: Options, like: Prepared) -> None:
+        self.circuit, self.bounds = options.circuit, of_circuit(options.bounds, options.circuit)
+        self.prior = ElementPrior.of(options.known, options.circuit)
         self.estimator = like.estimator
-        self.driver = serving(like.driver, HarmonicDriver, str(like.estimator))
-        self.shared = like.shared
-        self.model = _model(options, self.driver, like.shared)
+        self.driver = untraced(serving(like.driver, HarmonicDriver, str(like.estimator)))
+        self.known = known_of(like.lane, self.driver, like.shared, MAXIMUM_LIKELIHOOD)
         self.rows: list[int] = []
         self.starts: list[_Start] = []
         self.remarks: list[int] = []
@@ -236,46 +173,89 @@ class _Group:
         """Identify the loads of a batch one by one."""
         starts = refitted(batch.lanes, batch.seen, self._alone, _late_by, _may_hum, _better)
         for start, seen in zip(starts, batch.seen, strict=True):
-            hum = Remark.mains_hum if start.hum else 0
-            self.remarks.append(remarks_on(seen, self.estimator) | hum)
+            remarks = remarks_on(seen, self.estimator)
+            remarks |= Remark.mains_hum if start.hum else 0
+            self.remarks.append(remarks | (Remark.falls_with_current if start.falls else 0))
         self.rows += batch.rows
         self.starts += starts
         self.unloaded += map(checksum, batch.seen)
         self.repeats += repeats(batch.seen)
 
     def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
-        fit = _ALONE[worth_compiling(self.total)]
-        several = filled(lanes), jax.device_put(len(lanes))
-        found = jax.device_get(fit(*several, self.model, self.driver))
-        return unstacked(found)[: len(lanes)]
+        parts = [lanes[first : first + ROWS] for first in range(0, len(lanes), ROWS)]
+        return [one for few in parts for one in self._of_few(few)]
 
-    def several(self) -> list[int]:
-        """Checksums of the unloaded records that several recordings share."""
-        return [key for key, count in Counter(self.unloaded).items() if count > 1]
+    @one_thread()
+    @array_function
+    def _of_few(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
+        lanes = cast("Sequence[Harmonics]", lanes)  # the method checks it
+        source = source_of(self.known)
+        load = loads_of(lanes, source, self.circuit, self.prior, calibrated(self.known))
+        found = fit_alone(load, starts_of(load))
+        errors = np.zeros((len(lanes), 0))
+        if source.tolerances is not None and source.errors is not None:
+            errors = source.errors.at + found.z @ source.errors.by_z
+        changed = np.zeros(len(lanes), bool)
+        if self.known.shape is not None:
+            changed = differs(jax.tree.map(np.asarray, self.known.shape), load.records)
+        good = found.settled & np.isfinite(found.chi2) & ~misses(found.chi2, found.rrse)
+        used = good & ~changed & ~found.other & ~(found.strain > STRAINED)
+        signs = used, found.hum, found.falls, changed, found.other
+        return [
+            _Start(*of) for of in zip(lanes, found.logs, found.delays, errors, *signs, strict=True)
+        ]
 
     def loads(self) -> Loads:
-        loads = stacked([start.loads for start in self.starts])
-        number = {key: i for i, key in enumerate(self.several())}
+        """The recordings for a joint fit."""
+        lanes = [start.lane for start in self.starts]
+        load = loads_of(lanes, source_of(self.known), self.circuit, self.prior, None)
+        of, same = self.known.records, None
+        if of is not None and of.x.shape[-1] == load.records.x.shape[-1]:
+            same = np.array([[same_unloaded(x, one) for one in of.x] for x in load.records.x])
+        several = [key for key, count in Counter(self.unloaded).items() if count > 1]
+        number = {key: i for i, key in enumerate(several)}
         unloaded = np.array([number.get(key, -1) for key in self.unloaded])
-        return eqx.tree_at(lambda of: of.unloaded, loads, unloaded)
+        used = np.array([start.used for start in self.starts])
+        return Loads(load, same if np.any(same) else None, used, unloaded)
+
+    def judged(self, found: Estimate) -> Fit:
+        """Fits with their verdicts."""
+        names = self.circuit.names()
+        told = np.asarray(self.circuit.values()) if self.prior is None else self.prior.told
+        width = np.full(len(names), np.inf) if self.prior is None else self.prior.width
+        changed = np.zeros(len(self.starts), bool)  # they take no part
+        of = self.circuit, self.driver.result, changed, METHOD, np.asarray(told), np.asarray(width)
+        return judged(found, *of, self.bounds)
+
+    def concluded(self, fits: Fit, driver: HarmonicDriver, narrow: AnyArray) -> Fit:
+        """Fits with remarks, with the verdicts of recordings that take no part, and with changes.
+
+        These verdicts are `misfit` for another circuit or gain, and `inconsistent` where the driver
+        has changed. `narrow` says where a narrower prior of the delays was used.
+        """
+        changed, other = np.array([(one.changed, one.other) for one in self.starts]).T
+        names = np.where(other & (fits.verdict == "successful"), "misfit", fits.verdict)
+        names = np.where(changed & np.isin(names, ("successful", "misfit")), "inconsistent", names)
+        fits = dataclasses.replace(fits, result=verdicts_of(names))
+        remarks = np.where(narrow, np.array(self.remarks) | Remark.small_delays, self.remarks)
+        return concluded(fits, driver, remarks.tolist(), self.repeats)
 
 
 def _late_by(lanes: Sequence[AbstractLane], starts: Sequence[_Start]) -> dict[int, Lags]:
     del lanes
-    each = [map(float, start.loads.own.delays()) for start in starts]
     # A fit allows for one sample.
-    late = {row: Lags.of(*of, left=1.0) for row, of in enumerate(each)}
+    late = {row: Lags.of(*start.delays.tolist(), left=1.0) for row, start in enumerate(starts)}
     return {row: by for row, by in late.items() if any(by)}
 
 
 def _may_hum(starts: Sequence[_Start]) -> list[int]:
-    return [row for row, one in enumerate(starts) if one.hum or not one.loads.used]
+    return [row for row, one in enumerate(starts) if one.hum or not one.used]
 
 
 def _better(first: _Start, second: _Start) -> _Start:
-    if second.loads.used and second.hum:
+    if second.used and second.hum:
         return second._replace(changed=first.changed)
-    return first._replace(hum=np.asarray(False))
+    return first._replace(hum=False)
 
 
 @in_float64
@@ -357,7 +337,7 @@ def identify_jointly(
                 check_new(f"study[{paths[row]!r}]", seen.recording, first)
             lengths = groups.setdefault(drivers.of(batch.seen[0].recording), {})
             key = _key(batch.like)
-            lengths[key] = lengths.get(key) or _Group(only, batch.like, len(paths))
+            lengths[key] = lengths.get(key) or _Group(only, batch.like)
             lengths[key].add(batch)
         else:
             refused |= dict.fromkeys(batch.rows, NOT_PERIODIC)
@@ -365,9 +345,9 @@ def identify_jointly(
         fits[row], notes[row] = failed_fit(refusal.name, only, METHOD), refusal.note
     for names, lengths in tqdm(groups.items(), unit="driver", disable=not progress):
         together = list(lengths.values())
-        found, drivers.found[names] = _fit_together(only, together)
-        for group, judged in zip(together, found, strict=True):
-            keep(group.rows, judged, drivers.found[names])
+        found, drivers.found[names] = _fit_together(together)
+        for group, fitted in zip(together, found, strict=True):
+            keep(group.rows, fitted, drivers.found[names])
     ordered = stacked([fits[row] for row in range(len(paths))])
     outcome = table([fields_of(study, path) for path in paths], ordered, notes)
     settings = options.settings(study, len(paths), METHOD)
@@ -387,59 +367,46 @@ def _check_steady(study: Study, instrument: Instrument | None) -> None:
         )
 
 
-def _fit_together(options: Options, groups: Sequence[_Group]) -> tuple[list[Fit], HarmonicDriver]:
+@one_thread()
+def _fit_together(groups: Sequence[_Group]) -> tuple[list[Fit], HarmonicDriver]:
     """The fits of all recordings of one driver, by group, and the driver."""
     driver, loads = groups[0].driver, [group.loads() for group in groups]
-    several = tuple(len(group.several()) for group in groups)
-    model = _model(options, driver, any(group.shared for group in groups))
-    together = _TOGETHER[worth_compiling(sum(of.used.size for of in loads))]
-    found, better, delays, cov = together(model, loads, several, driver)
-    found, delays, cov = jax.device_get((found, delays, cov))
+    told, starts = driver.instrument, [one for group in groups for one in group.starts]
+    # With all errors of the instrument that a budget shows.
+    of = dataclasses.replace(Calibrations.of(driver), instrument=told and told.narrow())
+    used = [start.errors for start in starts if start.used]
+    errors = np.mean(used, axis=0) if used else np.zeros(of.tolerances.size)
+    owns = [np.array([np.concatenate([one.logs, one.delays]) for one in group.starts])
+            for group in groups]  # fmt: skip
+    found = fit_together(of, loads, start_of(of, errors), owns, told)
+    fits = [group.judged(one) for group, one in zip(groups, found.estimates, strict=True)]
+    better = _better_driver(driver, of, found)
     small = [np.zeros(len(group.rows), bool) for group in groups]
-    widest = float(np.asarray(model.calibrations.delay_width))
-    width = _narrower(loads, found, delays, cov, float(driver.sample_rate), widest)
+    width = _narrower(loads, fits, found.delays, found.cov, float(of.rate), float(of.delay_width))
     if width is not None and better.verdict == "successful":
-        # A start with errors of the instrument is made from the calibrations alone.
-        start = better if driver.instrument is None else driver
-        again = dataclasses.replace(_calibrations(start), delay_width=jax.device_put(width))
-        model = dataclasses.replace(model, calibrations=again)
-        others, better, *_ = together(model, loads, several, better)
-        others = jax.device_get(others)
-        for number, (first, second) in enumerate(zip(found, others, strict=True)):
+        of = dataclasses.replace(of, delay_width=np.asarray(width))
+        found = fit_together(of, loads, found.common, found.owns, told)
+        better = _better_driver(driver, of, found)
+        for number, (group, one) in enumerate(zip(groups, found.estimates, strict=True)):
+            first, second = fits[number], group.judged(one)
             where = (first.verdict == "successful") & (second.verdict == "successful")
-            small[number], found[number] = where, replaced(first, where, taken(second, where))
-    # A compiled function returns JAX arrays. The checksums must stay a numpy array.
-    better = dataclasses.replace(better, method=METHOD, unloaded=driver.unloaded)
-    changed = any(start.changed for group in groups for start in group.starts)
-    if changed and not any(np.any(of.used) for of in loads):
+            small[number], fits[number] = where, replaced(first, where, taken(second, where))
+    if any(one.changed for one in starts) and not any(one.used for one in starts):
         better = dataclasses.replace(better, result=verdict("inconsistent"))
-    judged = []
-    for group, fit, narrow in zip(groups, found, small, strict=True):
-        remarks = np.where(narrow, np.array(group.remarks) | Remark.small_delays, group.remarks)
-        alone = _alone_judged(fit, group.starts)
-        judged.append(concluded(alone, better, remarks.tolist(), group.repeats))
-    return judged, better
+    each = zip(groups, fits, small, strict=True)
+    return [group.concluded(found, better, narrow) for group, found, narrow in each], better
 
 
-def _alone_judged(fits: Fit, starts: Sequence[_Start]) -> Fit:
-    """Fits without remarks on hum, with the verdicts of recordings that take no part.
-
-    That is `misfit` for another circuit or gain, and `inconsistent` where the driver has changed.
-    """
-    changed, other = np.array([(bool(one.changed), bool(one.other)) for one in starts]).T
-    names = np.where(other & (fits.verdict == "successful"), "misfit", fits.verdict)
-    names = np.where(changed & np.isin(names, ("successful", "misfit")), "inconsistent", names)
-    result = verdicts_of(names)
-    # The fit of each recording alone decides whether hum is left out.
-    return dataclasses.replace(fits, remarks=fits.remarks & ~int(Remark.mains_hum), result=result)
-
-
-def _model(options: Options, driver: HarmonicDriver, shared: bool) -> Joint:
-    prior = ElementPrior.of(options.known, options.circuit)
-    return Joint(options.circuit, _calibrations(driver), shared, prior, options.bounds)
-
-
-def _calibrations(driver: HarmonicDriver) -> Calibrations:
-    """The calibrations, with all errors of the instrument that a budget shows."""
-    told = driver.instrument
-    return dataclasses.replace(Calibrations.of(driver), instrument=told and told.narrow())
+def _better_driver(driver: HarmonicDriver, of: Calibrations, found: Found) -> HarmonicDriver:
+    """The driver that all recordings together determine."""
+    kept, result = of.parameters(found.common).size, driver.result
+    if found.strain > STRAINED:
+        result = verdict("inconsistent")
+    return dataclasses.replace(
+        driver,
+        source=of.source_of(found.common),
+        cov=found.cov[:kept, :kept],
+        calibration=dataclasses.replace(driver.calibration, delay_samples=of.delays(found.common)),
+        result=result,
+        method=METHOD,
+    )

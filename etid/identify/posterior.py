@@ -32,11 +32,11 @@ from etid.estimators.element_prior import ElementPrior
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, taken
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.rows import ROWS, calibrated, loads_of, source_of
+from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.fitting import fits_of, is_shared, known_of
-from etid.likelihood.search import Load, minimum
+from etid.likelihood.search import ROWS, Load, minimum
 from etid.numpy_tier.algebra import one_thread
 from etid.precision import array_function, in_float64
 from etid.recordings.preflight import Inspected

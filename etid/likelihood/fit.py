@@ -6,11 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from etid.circuits.directions import DIRECTIONS, ON_LOADS, SEEN, named, scored
+from etid.circuits.directions import ON_LOADS, SEEN
 from etid.likelihood import scores
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.linear import diagonal, inverse
 from etid.likelihood.noise import excess, shows_hum
+from etid.likelihood.profile import rrse
 from etid.likelihood.scores import Linear, Scores
 from etid.likelihood.search import Load, minimum
 from etid.likelihood.source import Errors
@@ -20,8 +21,6 @@ from etid.results.instrument import BUDGETED, LATER, Effects
 from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex, power
 
-DOUBTED = 2.5  # standard deviations of a gain that goes into ±; one good recording in 80 has them
-GAIN = 0.02  # standard deviation of the gain between two channels that nobody compared
 NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
 SHARE = 0.5  # of the excess of χ², from which on a falling resistance is named as its cause
 UNSURE = 4.0  # standard deviations of χ² that are no excess
@@ -37,6 +36,7 @@ class Estimate(NamedTuple):
     Attributes:
         logs: Logarithms of the elements.
         delays: Trigger delay of each output [samples].
+        z: Changes of the source (`etid.likelihood.source`).
         cov: Covariance of `logs`.
         shared_cov: The part of it that comes from the driver.
         chi2: Σ r² per degree of freedom.
@@ -59,6 +59,7 @@ class Estimate(NamedTuple):
 
     logs: Float[AnyArray, "*row element"]
     delays: Float[AnyArray, "*row output"]
+    z: Float[AnyArray, "*row z"]
     cov: Float[AnyArray, "*row element element"]
     shared_cov: Float[AnyArray, "*row element element"]
     chi2: Float[AnyArray, "*row"]
@@ -105,21 +106,16 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
         spread,
         precision,
     )
-    place = at_knots.departing(at, near.slopes)
-    changes = {name: DIRECTIONS[name].change(place) for name in scored()}
-    rows = condensed.rows(xp.concatenate(list(changes.values()), -3))
-    each = scores.smooth(linear, rows, e)
-    each = each.named({name: of.shape[-3] for name, of in changes.items()})
+    changes = scores.changes(load, near)
+    rows = {name: condensed.rows(of) for name, of in changes.items()}
+    each = scores.of_changes(linear, rows, e)
     gain, spreads, layer = (each[name].of_changes(0) for name in ("gain", "spread", "layer"))
     added = scores.falling(near, every)
     each["falling"] = scores.rough(linear, added, near, every, share, noise, e)
     fall = each["falling"].of_changes(0)
 
     squares, terms = 2 * profile.objective, records.terms
-    seen = {name: DIRECTIONS[name].seen(*of[:3]).any(-1) for name, of in each.items()}
-    seen["falling"] = seen["falling"] & (fall.z > 0)
-    relevant = [DIRECTIONS[name].relevant(*each[name][:3]) for name in named()]
-    relevant = xp.concatenate(relevant, -1)
+    seen, relevant = scores.seen(each), scores.relevant(each)
     over = squares - terms - UNSURE * xp.sqrt(2 * terms)
     causes = (fall.z >= xp.abs(relevant).max(-1)) & (fall.explained > SHARE * over)
 
@@ -144,10 +140,8 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
     if load.unloaded is not None:
         of_unloaded = (mean_noise - mean_private)[..., None, :]
         shared = shared + (by_term * of_unloaded) @ by_term.swapaxes(-1, -2)
-    doubtful = (xp.abs(gain.z) > DOUBTED) & ~seen["gain"]
-    mean = gain.size / (1 + (gain.stderr / GAIN) ** 2)
-    shift = xp.where(doubtful[..., None], mean[..., None] * gain.slope, 0.0)
-    shared = shared + shift[..., :, None] * shift[..., None, :]
+    doubtful, of_doubt = scores.doubt(gain, seen["gain"])
+    shared = shared + of_doubt
     # For an element without any effect the matrix product contains only rounding errors.
     variance = diagonal(elements[..., :e])
     unknown = xp.where(variance > 1, variance, 0.0)[..., None] * np.eye(e)
@@ -167,26 +161,23 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
         xp.where(possible[..., None], spreads.slope, 0.0),
         _would_show(layer, np.asarray(gains.circuit.scaling()[0])),
     )
-    found = {
-        verdict: sum(seen[name] for name in seen if DIRECTIONS[name].verdict == verdict) > 0
-        for verdict in ("misfit", "inconsistent")
-    }
-    contradicts = found["inconsistent"]
+    other, contradicts = scores.verdicts(seen)
     width = load.width[e]  # of the prior of the delay of V_out
-    contradicts = contradicts | _beyond(delays[..., 0] / width, bread[..., e, e] / width**2)
+    contradicts = contradicts | beyond(delays[..., 0] / width, bread[..., e, e] / width**2)
     if source.tolerances is not None and source.errors is not None:
         by_z = source.errors.by_z[:, :FAULTS]  # the calibrations show those of their resistors
         told = (by_z * (bread[..., owned:, owned:] @ by_z)).sum(-2)
         errors = source.errors.at + z @ source.errors.by_z
-        contradicts = contradicts | _beyond(errors[..., :FAULTS], told).any(-1)
+        contradicts = contradicts | beyond(errors[..., :FAULTS], told).any(-1)
     direct = xp.concatenate([each[name].others for name in ON_LOADS], -2)
     return Estimate(
         logs=logs,
         delays=delays,
+        z=z,
         cov=own + shared + unknown,
         shared_cov=shared,
         chi2=squares / (terms - owned),
-        rrse=_rrse(load, profile.gains),
+        rrse=rrse(load.records, profile.gains),
         settled=least.settled,
         points=least.points,
         strain=strain,
@@ -194,7 +185,7 @@ def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0)
         falls=causes & seen["falling"],
         doubtful=doubtful,
         far=xp.sqrt(moved) > FAR,
-        other=found["misfit"],
+        other=other,
         inconsistent=contradicts,
         support=support,
         effects=_effects(source.errors, bread, direct, e, owned),
@@ -222,18 +213,10 @@ def _would_show(layer: Scores, powers: np.ndarray) -> Float[AnyArray, "*row"]:
     return xp.where(xp.isfinite(layer.z), deviations, 0.0)
 
 
-def _beyond(z: Float[AnyArray, "*error"], variance: Float[AnyArray, "*error"]) -> AnyArray:
+def beyond(z: Float[AnyArray, "*error"], variance: Float[AnyArray, "*error"]) -> AnyArray:
     """Whether an error of the instrument, in its standard deviations, contradicts its tolerance."""
     xp, left = namespace(z), 1 - variance  # the prior and the data differ by N(0, 1 − its variance)
     return z**2 > SEEN**2 * xp.where(left > UNSEEN, left, np.inf)
-
-
-def _rrse(load: Load, gains: AnyArray) -> Float[AnyArray, "*row"]:
-    """RRSE of the output that is predicted worst."""
-    xp, records = namespace(gains), load.records
-    missed = xp.where(records.used, power(gains * records.x[..., None, :] - records.y), 0.0)
-    whole = xp.where(records.used, power(records.y), 0.0)
-    return xp.sqrt(missed.sum(-1) / whole.sum(-1)).max(-1)
 
 
 def _effects(

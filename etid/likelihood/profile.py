@@ -164,6 +164,14 @@ class Profile(NamedTuple):
                 for i in range(count)]  # fmt: skip
 
 
+def rrse(records: Records, gains: Complex[AnyArray, "*row output bin"]) -> Float[AnyArray, "*row"]:
+    """RRSE of the output that is predicted worst."""
+    xp = namespace(gains)
+    missed = xp.where(records.used, power(gains * records.x[..., None, :] - records.y), 0.0)
+    whole = xp.where(records.used, power(records.y), 0.0)
+    return xp.sqrt(missed.sum(-1) / whole.sum(-1)).max(-1)
+
+
 class Condensed(NamedTuple):
     """A likelihood as a function of the gains at the knots.
 

@@ -18,18 +18,23 @@ The rest of the circuit filters it like the voltage of the relaxations, and the 
 of Z_L. So it is a change of the outputs at all harmonics.
 """
 
+import functools
+import operator
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
+from etid.circuits.directions import DIRECTIONS, named, scored
 from etid.likelihood.linear import inverse
-from etid.likelihood.search import Near
+from etid.likelihood.search import Load, Near
 from etid.precision import namespace
 from etid.signals.knots import Knots
 from etid.signals.transfer import AnyArray, as_complex, power, reciprocal
 
+DOUBTED = 2.5  # standard deviations of a gain that goes into ±; one good recording in 80 has them
+GAIN = 0.02  # standard deviation of the gain between two channels that nobody compared
 HARMONICS = 512  # that a pulse needs, up to 30 kHz; without the rest z is a few per cent smaller
 FINE = 2  # points of the grid in time, relative to twice the number of these harmonics
 NOTHING = 1e-9  # of the power of a change; rounding leaves less of one that the circuit can make
@@ -53,7 +58,7 @@ class Linear(NamedTuple):
     noise: Float[AnyArray, "*row part"]
     residual: Float[AnyArray, "*row part"]
     pull: Float[AnyArray, "*row q"]
-    spread: Float[AnyArray, "q q"]
+    spread: Float[AnyArray, "*row_or_not q q"]
     bread: Float[AnyArray, "*row q q"]
 
     @classmethod
@@ -142,6 +147,62 @@ def smooth(linear: Linear, rows: Float[AnyArray, "*row change part"], elements: 
     return Scores.of(
         score, sums[..., 0] + of_priors, sums[..., 1] + of_priors, whole, others, elements
     )
+
+
+def changes(load: Load, near: Near) -> dict[str, Complex[AnyArray, "*row change output knot"]]:
+    """Derivatives of the gains with respect to each change that a fit tests for."""
+    place = load.gains.at(load.knots.index).departing(near.q, near.slopes)
+    return {name: DIRECTIONS[name].change(place) for name in scored()}
+
+
+def of_changes(
+    linear: Linear, rows: Mapping[str, Float[AnyArray, "*row change part"]], elements: int
+) -> dict[str, Scores]:
+    """Scores of named changes of the gains: `rows` are those of the terms."""
+    every = namespace(linear.residual).concatenate(list(rows.values()), -2)
+    found = smooth(linear, every, elements)
+    return found.named({name: of.shape[-2] for name, of in rows.items()})
+
+
+def seen(each: Mapping[str, Scores]) -> dict[str, Bool[AnyArray, "*row"]]:
+    """Whether the data show each of `DIRECTIONS`."""
+    found = {name: DIRECTIONS[name].seen(*of[:3]).any(-1) for name, of in each.items()}
+    if "falling" in each:  # no resistance grows with its current
+        found["falling"] = found["falling"] & (each["falling"].z[..., 0] > 0)
+    return found
+
+
+def verdicts(
+    seen: Mapping[str, Bool[AnyArray, "*row"]],
+) -> tuple[Bool[AnyArray, "*row"], Bool[AnyArray, "*row"]]:
+    """Whether what is seen makes a fit a misfit, and whether it is inconsistent."""
+    misfit, inconsistent = (
+        functools.reduce(operator.or_, [on for name, on in seen.items()
+                                        if DIRECTIONS[name].verdict == verdict])
+        for verdict in ("misfit", "inconsistent")
+    )  # fmt: skip
+    return misfit, inconsistent
+
+
+def relevant(each: Mapping[str, Scores]) -> Float[AnyArray, "*row change"]:
+    """Z of the changes that have a name; 0 for those that do not matter."""
+    found = [DIRECTIONS[name].relevant(*each[name][:3]) for name in named()]
+    return namespace(*found).concatenate(found, -1)
+
+
+def doubt(
+    gain: Scores, proven: Bool[AnyArray, "*row"]
+) -> tuple[Bool[AnyArray, "*row"], Float[AnyArray, "*row element element"]]:
+    """Whether another gain is likely, and the covariance that it then adds.
+
+    One standard deviation of the logarithms of the elements is what they change by its mean, given
+    the score and a prior of width `GAIN`. A gain that is proven makes the fit a misfit.
+    """
+    xp = namespace(gain.z)
+    doubtful = (xp.abs(gain.z) > DOUBTED) & ~proven
+    mean = gain.size / (1 + (gain.stderr / GAIN) ** 2)
+    shift = xp.where(doubtful[..., None], mean[..., None] * gain.slope, 0.0)
+    return doubtful, shift[..., :, None] * shift[..., None, :]
 
 
 def rough(

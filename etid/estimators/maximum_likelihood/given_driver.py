@@ -14,7 +14,7 @@ A calibration with R shows log(R X / Y), which is W apart from −jωτ, linear 
 where H is the curvature of the likelihood of the calibrations, and z₀ is the remaining step to its
 minimum. A load is identified *jointly* with z. The fit uses the information of its record about
 Z_th, and about the delay that one known resistor does not determine. It does not evaluate the terms
-of the calibrations again, which would take ten times as long. `etid.estimators.joint.fit` uses the
+of the calibrations again, which would take ten times as long. `etid.likelihood.joint.fit` uses the
 terms themselves, for many loads at once. Both estimates have the same errors against the truth, but
 they are not equal. They may differ by a standard error along the direction that one known resistor
 does not determine.

@@ -14,7 +14,7 @@ from etid.estimators.maximum_likelihood.verdict import judged
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import Gains, Voltage, VoltageAndCurrent
 from etid.likelihood.profile import Records
-from etid.likelihood.search import Load
+from etid.likelihood.search import ROWS, Load
 from etid.likelihood.shared import Calibrated, Unloaded
 from etid.likelihood.source import Errors, Source, Tolerances
 from etid.likelihood.source_prior import DELAY_WIDTH
@@ -26,8 +26,6 @@ from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
 from etid.signals.harmonics import same_unloaded
-
-ROWS = 16  # recordings side by side: their arrays stay in the cache of a processor
 
 
 def source_of(known: GivenDriver) -> Source:

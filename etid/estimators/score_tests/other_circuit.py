@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from etid.circuits.directions import DIRECTIONS, named, scored
-from etid.likelihood.fit import DOUBTED, GAIN
 from etid.likelihood.sandwich import Linear
+from etid.likelihood.scores import DOUBTED, GAIN
 from etid.signals.transfer import AnyArray
 
 # For a methods section.
