@@ -49,6 +49,20 @@ def array_function(function: Callable[Parameters, Result]) -> Callable[Parameter
     return call
 
 
+def held(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """The function of arrays without a derivative; JAX traces it once for each shape."""
+    traced = jax.jit(function)
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        if namespace(*jax.tree.leaves((args, kwargs))) is np:
+            return function(*args, **kwargs)
+        args, kwargs = jax.lax.stop_gradient((args, kwargs))
+        return traced(*args, **kwargs)
+
+    return call
+
+
 def in_float64(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """The function, run in float64, with NaN as a result. The process keeps its own settings.
 

@@ -165,8 +165,7 @@ class Harmonics(AbstractLane):
         least = jnp.stack([m.sigma_th, m.sigma_out])[:, None] ** 2 / periods[1]
         found = jax.vmap(lambda v: noise_of(v, *periods).variance)(records)
         noise = jax.lax.stop_gradient(jnp.maximum(found, least))
-        fields = map(jnp.asarray, filled(both, noise, m.sample_rate, *periods))
-        frequency, x, y, of_x, of_y, selected = fields
+        frequency, x, y, of_x, of_y, selected = filled(both, noise, m.sample_rate, *periods)
         if joins_aliases(*periods):
             # As the noise, they are no data of the fit: derivatives by the records hold them.
             of_x, of_y = (

@@ -14,7 +14,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method
 from etid.identify.arguments import require
 from etid.identify.fitting import skin_lane
 from etid.identify.options import Options, candidates_of, check_default
-from etid.precision import in_float64
+from etid.precision import in_float64, untraced
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
@@ -69,16 +69,15 @@ def identify_samples(
         estimator = _default(driver, periods[0])
         check_default(estimator, options.circuits)
     estimator.check_driver(driver, sample_rate)
-    v_th, v_out, step, rate = (
-        jnp.asarray(unmasked(value), float) for value in (v_th, v_out, resolution, sample_rate)
-    )
+    v_th, v_out, step = (jnp.asarray(unmasked(value), float) for value in (v_th, v_out, resolution))
+    rate = untraced(unmasked(sample_rate))
     # At harmonics the noise is measured, and its floor is needed only. White noise is a median: by
     # its derivative, few samples would have most of the weight.
     of = floor if estimator.lane.periodic else noise
     of_th, of_out = (jax.lax.stop_gradient(jnp.asarray(of(v, step))) for v in (v_th, v_out))
     lane = estimator.lane.of_samples(Measurement(v_th, v_out, of_th, of_out, rate), periods)
     known = (
-        estimator.known(driver, jnp.asarray(lane.frequency), True)
+        estimator.known(*untraced((driver, lane.frequency)), True)
         if isinstance(lane, Harmonics)
         else None
     )

@@ -13,9 +13,9 @@ from etid.likelihood.linear import diagonal, inverse
 from etid.likelihood.noise import excess, shows_hum
 from etid.likelihood.profile import rrse
 from etid.likelihood.scores import Linear, Scores
-from etid.likelihood.search import Load, minimum
+from etid.likelihood.search import Load, Minimum, minimum
 from etid.likelihood.source import Errors
-from etid.precision import array_function, namespace
+from etid.precision import array_function, held, namespace
 from etid.results.fit import Support
 from etid.results.instrument import BUDGETED, LATER, Effects
 from etid.signals.harmonics import signal_share
@@ -79,12 +79,24 @@ class Estimate(NamedTuple):
 
 
 @array_function
-def fit(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0) -> Estimate:
-    """The fits from their starts; for the arguments see `etid.likelihood.search.minimum`."""
-    xp, gains = namespace(starts), load.gains
+def fit(
+    load: Load, starts: Float[AnyArray, "start *row q"], aside: Float[AnyArray, ""] | float = 0.0
+) -> Estimate:
+    """The fits from their starts; for the arguments see `etid.likelihood.search.minimum`.
+
+    Under JAX elements and delays have derivatives, and nothing else.
+    """
+    least = minimum(load, starts, aside)
+    logs, delays, _ = load.gains.split(least.q)
+    return _estimate(load, least)._replace(logs=logs, delays=delays)
+
+
+@held
+def _estimate(load: Load, least: Minimum) -> Estimate:
+    """Standard errors and tests of a minimum."""
+    xp, gains = namespace(least.q), load.gains
     source, e, owned = gains.source, gains.elements, gains.owned
     every, at_knots = load.knots, gains.at(load.knots.index)
-    least = minimum(load, starts, aside)
     # Standard errors and tests are those of the last point; they do not change in a short step.
     near, at = least.near, least.near.q
     records = load.known(at)

@@ -16,6 +16,7 @@ import dataclasses
 import functools
 from typing import ClassVar, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -23,7 +24,7 @@ from etid.circuits.circuit import AbstractCircuit, impedance_at, with_slopes
 from etid.circuits.directions import DIRECTIONS, ON_LOADS, At, Direction
 from etid.likelihood.profile import along_outputs
 from etid.likelihood.source import Source
-from etid.precision import namespace
+from etid.precision import Module, namespace
 from etid.signals.transfer import AnyArray, as_complex, frequency_variable, reciprocal, turns
 
 FAULTS = len(ON_LOADS)  # errors of the instrument that act on a load
@@ -31,7 +32,7 @@ FAULTS = len(ON_LOADS)  # errors of the instrument that act on a load
 _Numbers = Complex[AnyArray, "*row bin"]
 
 
-class AbstractOutputs(abc.ABC):
+class AbstractOutputs(Module):
     """The outputs as functions of the impedance of the load and the current through it.
 
     Attributes:
@@ -90,6 +91,7 @@ class Slopes(NamedTuple):
     by_q: Complex[AnyArray, "*row q output bin"]
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Gains:
     """The gains of loads behind one driver.
@@ -105,7 +107,7 @@ class Gains:
     source: Source
     circuit: AbstractCircuit
     frequency: Float[AnyArray, "*row bin"]
-    sample_rate: float
+    sample_rate: Float[AnyArray, ""] | float
     outputs: AbstractOutputs = dataclasses.field(default_factory=Voltage)
 
     @property

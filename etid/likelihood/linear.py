@@ -26,6 +26,8 @@ SMALLEST = 1e-12  # the same for an inverse
 GOOD = 0.75  # of the reduction that a step promises, from which on the next is damped less
 LEAST = 1e-12  # damping after a step that failed, at least
 ACCELERATION = 0.75  # largest second-order part relative to the step (Transtrum and Sethna)
+LEFT = 1e-5  # of a right side, which its solution may leave
+PRODUCTS = 50  # largest number of products for a solution; it takes two or three
 DIFFERENCE = 0.1  # of a step, for its second derivative (ibid.)
 
 
@@ -56,6 +58,12 @@ class NormalEquations(NamedTuple):
         finite = xp.isfinite(objective) & xp.isfinite(gradient).all(-1)
         objective = xp.where(finite, objective, np.inf)
         return cls(objective, gradient, rows @ rows.swapaxes(-1, -2), terms, rows)
+
+    def along(self, free: Bool[AnyArray, " q"]) -> "NormalEquations":
+        """The same with the other parameters fixed."""
+        xp = namespace(self.matrix, free)
+        matrix = xp.where(free[:, None] & free, self.matrix, np.eye(free.shape[0]))
+        return self._replace(gradient=xp.where(free, self.gradient, 0.0), matrix=matrix)
 
     @property
     def scale(self) -> Float[AnyArray, "*row q"]:
@@ -161,13 +169,15 @@ class LevenbergMarquardt:
             of them is not taken.
         curved: Whether steps follow the curvature of the terms, which are then `Curved`.
         relative: Part of the objective that is always enough.
+        free: Parameters that move; None for all.
     """
 
-    damping: float
+    damping: Float[AnyArray, ""] | float
     steps: int
     patience: int = 1
     curved: bool = False
     relative: float = 0.0
+    free: Bool[AnyArray, " q"] | None = None
 
     def __call__(
         self,
@@ -202,6 +212,7 @@ class LevenbergMarquardt:
 
     def _proposed(self, problem: Problem, state: State) -> State:
         xp, at = namespace(state.q), state.equations
+        at = at if self.free is None else at.along(self.free)
         scale = xp.maximum(state.scale, at.scale)
         move = at.step(state.damping, scale)
         ends = state.idle + (at.promised(move) <= self._enough(state)) >= self.patience
@@ -288,3 +299,55 @@ def repeated(step: Callable[[Any], Any], state: Any, steps: int) -> Any:
         (0, state),
     )
     return state
+
+
+class _Conjugate(NamedTuple):
+    """Where conjugate gradients are: solution, what is left, next direction, size of what is left.
+
+    `moves` says whether this is not small yet.
+    """
+
+    x: Float[AnyArray, " q"]
+    left: Float[AnyArray, " q"]
+    way: Float[AnyArray, " q"]
+    size: Float[AnyArray, ""]
+    moves: Bool[AnyArray, ""]
+
+
+def conjugate_gradients(
+    product: Callable[[Any], Any], inverse: Float[AnyArray, "q q"], b: Float[AnyArray, " q"]
+) -> Float[AnyArray, " q"]:
+    """Solution of H x = b under JAX, with derivatives in b.
+
+    Args:
+        product: H times a vector; H is positive definite.
+        inverse: Nearly the inverse of H; the better it is, the fewer products are needed.
+        b: The right side.
+    """
+
+    def solve(product: Callable[[Any], Any], b: Float[AnyArray, " q"]) -> Float[AnyArray, " q"]:
+        way = inverse @ b
+        whole = b @ way
+
+        def step(of: _Conjugate) -> _Conjugate:
+            along = product(of.way)
+            far = of.size / (of.way @ along)
+            left = of.left - far * along
+            back = inverse @ left
+            size = left @ back
+            x, way = of.x + far * of.way, back + size / of.size * of.way
+            return _Conjugate(x, left, way, size, size > LEFT**2 * whole)
+
+        start = _Conjugate(namespace(b).zeros_like(b), b, way, whole, whole > 0)
+        return repeated(step, start, PRODUCTS).x
+
+    return jax.lax.custom_linear_solve(product, b, solve, solve, symmetric=True)
+
+
+def in_turn(step: Callable[..., Any], state: Any, arguments: Sequence[AnyArray]) -> Any:
+    """Steps with each of the arguments: a loop of Python for NumPy, one of JAX for JAX."""
+    if namespace(*jax.tree.leaves((state, arguments))) is np:
+        for of in zip(*arguments, strict=True):
+            state = step(state, *of)
+        return state
+    return jax.lax.scan(lambda state, of: (step(state, *of), None), state, tuple(arguments))[0]

@@ -4,12 +4,18 @@ The likelihood of all harmonics is expensive. Condensed to the knots near one po
 (`etid.likelihood.profile`) it is not: the minimum of the condensed terms is the next point, where
 it is condensed again. A point that is worse than the best before it is replaced by the middle
 between both. Mostly two or three points are enough.
+
+JAX differentiates the minimum as an implicit function. The gradient g of ½ Σ r² of all terms is 0
+there, so that with any number θ of the problem the minimum q moves by
+
+    ∂q/∂θ = −H⁻¹ ∂g/∂θ,      H = ∂g/∂q.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
@@ -19,12 +25,15 @@ from etid.likelihood.linear import (
     LevenbergMarquardt,
     NormalEquations,
     chosen,
+    conjugate_gradients,
+    in_turn,
+    inverse,
     replaced,
     taken,
 )
 from etid.likelihood.profile import Condensed, Profile, Records
 from etid.likelihood.shared import Unloaded
-from etid.precision import array_function, namespace
+from etid.precision import array_function, held, namespace
 from etid.signals.knots import DENSITY, Knots, knots
 from etid.signals.transfer import AnyArray, as_complex, reciprocal
 
@@ -44,6 +53,7 @@ ROUGHLY = 1e-3  # of ½ Σ r², which a step of a rough fit of a distant point r
 WELL = 0.1  # of the distance `BEFORE`, to which the condensed terms are minimised
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Load:
     """Recordings behind one driver, with all that their likelihood needs.
@@ -62,7 +72,7 @@ class Load:
     centre: Float[AnyArray, " q"]
     width: Float[AnyArray, " q"]
     unloaded: Unloaded | None = None
-    density: int = DENSITY
+    density: int = dataclasses.field(default=DENSITY, metadata={"static": True})
 
     @property
     def knots(self) -> Knots:
@@ -86,6 +96,7 @@ class Load:
         """Terms of the priors."""
         return (q - self.centre) / self.width
 
+    @array_function
     def objective(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row"]:
         """½ Σ r² of all terms."""
         profile = Profile.of(self.known(q), self.gains(q))
@@ -172,23 +183,17 @@ def _equations(
 
 @dataclasses.dataclass(frozen=True)
 class _Knots:
-    """Condensed terms near a point, as a function of the parameters that are free."""
+    """Condensed terms near a point, as a function of the parameters."""
 
     load: Load
     at_knots: Gains
     near: Near
-    free: np.ndarray
 
     def equations(self, q: Float[AnyArray, "*row q"]) -> NormalEquations:
-        found, free = _equations(self.load, self.near, self.at_knots.slopes(q), q), self.free
-        if free.all():
-            return found
-        matrix = found.matrix * (free[:, None] & free) + np.diag(1.0 * ~free)
-        return found._replace(gradient=found.gradient * free, matrix=matrix)
+        return _equations(self.load, self.near, self.at_knots.slopes(q), q)
 
     def of(self, rows: np.ndarray) -> "_Knots":
-        of = self.load.of(rows), self.at_knots.of(rows), taken(self.near, rows)
-        return _Knots(*of, self.free)
+        return _Knots(self.load.of(rows), self.at_knots.of(rows), taken(self.near, rows))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,39 +247,74 @@ class _State(NamedTuple):
 
 
 @array_function
-def minimum(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 0.0) -> Minimum:
-    """The minimum, without a derivative.
+def minimum(
+    load: Load, starts: Float[AnyArray, "start *row q"], aside: Float[AnyArray, ""] | float = 0.0
+) -> Minimum:
+    """The minimum. Under JAX its `q` has a derivative, if the load has no axis of rows.
 
     Args:
         load: The recordings.
         starts: Starts, the likeliest first.
         aside: Distance of the first delay from that of the start [samples].
     """
-    at_knots = load.gains.at(load.knots.index)
-    near = _likeliest(load, at_knots, starts)
-    if load.gains.outputs.count > 1:
-        # These starts have no delays, and an approximation so far from the minimum may lead away.
-        near = _approached(load, at_knots, near)
-    if aside != 0:
-        shift = np.zeros(starts.shape[-1])
-        shift[load.gains.elements : load.gains.owned] = aside
-        near = Near.of(load, at_knots, near.q + shift)
-    xp, none = namespace(starts), np.zeros(starts.shape[1:-1], int)
-    better = xp.isfinite(near.objective)
-    state = _next(load, at_knots, near, near.q, better, xp.zeros_like(near.objective), none)
+    least = _search(load, starts, aside)
+    if namespace(least.q) is np:
+        return least
+    return least._replace(q=_with_derivative(least.q, least.near, load))
+
+
+@jax.custom_jvp
+def _with_derivative(
+    q: Float[AnyArray, "*row q"], near: Near, load: Load
+) -> Float[AnyArray, "*row q"]:
+    """The minimum q of a load, next to which the likelihood is known."""
+    del near, load
+    return q
+
+
+@_with_derivative.defjvp
+@array_function
+def _moved(
+    primals: tuple[Any, Near, Load], tangents: tuple[Any, Near, Load]
+) -> tuple[AnyArray, AnyArray]:
+    (q, near, load), (_, _, change) = primals, tangents
+    gradient = jax.grad(lambda q, load: load.objective(q))
+    _, by_load = jax.jvp(lambda load: gradient(q, load), (load,), (change,))
+    _, curved = jax.linearize(lambda q: gradient(q, load), q)
+    roughly = _equations(load, near, near.slopes, near.q).matrix
+    return q, -conjugate_gradients(curved, inverse(roughly), by_load)
+
+
+@held
+def _search(
+    load: Load, starts: Float[AnyArray, "start *row q"], aside: Float[AnyArray, ""] | float
+) -> Minimum:
+    xp, at_knots = namespace(starts), load.gains.at(load.knots.index)
+    place = np.arange(starts.shape[-1])
+    delays = (place >= load.gains.elements) & (place < load.gains.owned)
 
     def step(load: Load, at_knots: Gains, state: _State) -> _State:
         near = Near.of(load, at_knots, state.trial)
         reduced = state.near.objective - near.objective
         better = reduced >= 0
         kept = select(better, near, state.near)
+        reduced = xp.where(state.points > 0, reduced, 0.0)
         found = _next(load, at_knots, kept, state.trial, better, reduced, state.idle)
         return found._replace(points=state.points + 1)
 
     def goes_on(state: _State) -> Bool[AnyArray, "*row"]:
-        return ~state.settled & xp.isfinite(state.near.objective) & (state.points < POINTS)
+        finite = xp.isfinite(state.near.objective) | (state.points == 0)
+        return ~state.settled & finite & (state.points < POINTS)
 
     if xp is np:
+        near = _likeliest(load, at_knots, starts)
+        if load.gains.outputs.count > 1:
+            near = _approached(load, at_knots, near)
+        if aside != 0:
+            near = Near.of(load, at_knots, near.q + aside * delays)
+        none, better = np.zeros(starts.shape[1:-1], int), np.isfinite(near.objective)
+        nothing = np.zeros_like(near.objective)
+        state = _next(load, at_knots, near, near.q, better, nothing, none)
         while (live := np.flatnonzero(goes_on(state))).size:
             if live.size == len(none):
                 state = step(load, at_knots, state)
@@ -282,40 +322,55 @@ def minimum(load: Load, starts: Float[AnyArray, "start *row q"], aside: float = 
                 part = step(load.of(live), at_knots.of(live), taken(state, live))
                 state = replaced(state, live, part)
     else:
+        start = _best(load, starts)
+        if load.gains.outputs.count > 1:
+            start = _approached(load, at_knots, Near.of(load, at_knots, start)).q
+        # Only the loop evaluates the likelihood: each copy of its text compiles for a second.
         state = jax.lax.while_loop(
             lambda state: goes_on(state).any(),
             lambda state: select(goes_on(state), step(load, at_knots, state), state),
-            state,
+            _nowhere(load, at_knots, start + aside * delays),
         )
     q = xp.where(state.settled[..., None], state.target, state.near.q)
     promised = xp.where(state.settled, state.promised, 0.0)
     return Minimum(q, state.near, promised, state.settled, state.points)
 
 
+def _nowhere(load: Load, at_knots: Gains, start: Float[AnyArray, "*row q"]) -> _State:
+    """The state before the first point, under JAX."""
+    shapes = jax.eval_shape(lambda q: Near.of(load, at_knots, q), start)
+    near = jax.tree.map(lambda of: jnp.full(of.shape, np.nan, of.dtype), shapes)
+    infinite = jnp.full_like(near.objective, np.inf)
+    none = jnp.zeros(infinite.shape, int)
+    near = near._replace(objective=infinite)
+    return _State(start, near, start, infinite, infinite < 0, none, none)
+
+
 def _likeliest(load: Load, at_knots: Gains, starts: Float[AnyArray, "start *row q"]) -> Near:
-    """The likelihood near the first start, or near the best of all where its χ² is large."""
-    xp, first = namespace(starts), Near.of(load, at_knots, starts[0])
+    """The likelihood near the best start in NumPy, which tries the others only where it needs."""
+    first = Near.of(load, at_knots, starts[0])
     far = ~(2 * first.objective < NEAR * load.records.terms)
-
-    def best(load: Load, starts: Float[AnyArray, "start *row q"]) -> Float[AnyArray, "*row q"]:
-        objectives = load.objective(starts)
-        objectives = xp.where(xp.isfinite(objectives), objectives, np.inf)
-        place = xp.argmin(objectives, axis=0)[None, ..., None]
-        return xp.take_along_axis(starts, place, 0)[0]
-
-    if xp is not np:  # no branch: all starts are tried
-        return Near.of(load, at_knots, xp.where(far[..., None], best(load, starts), starts[0]))
     if len(starts) == 1 or not far.any():
         return first
     rows, of = np.flatnonzero(far), load.of(np.flatnonzero(far))
-    near = Near.of(of, at_knots.of(rows), best(of, starts[:, rows]))
+    near = Near.of(of, at_knots.of(rows), _best(of, starts[:, rows]))
     return replaced(first, rows, near) if rows.size < far.size else near
+
+
+def _best(load: Load, starts: Float[AnyArray, "start *row q"]) -> Float[AnyArray, "*row q"]:
+    """The first start, or the best of all where its χ² is large."""
+    xp, objectives = namespace(starts), load.objective(starts)
+    near = 2 * objectives[0] < NEAR * load.records.terms
+    objectives = xp.where(xp.isfinite(objectives), objectives, np.inf)
+    place = xp.where(near, 0, xp.argmin(objectives, axis=0))
+    return xp.take_along_axis(starts, place[None, ..., None], 0)[0]
 
 
 def _approached(load: Load, at_knots: Gains, near: Near) -> Near:
     """The likelihood near a point from which an approximation leads on, if `near` is far away.
 
-    The likelihood is condensed anew at each step of Levenberg-Marquardt.
+    The starts with a current have no delays, and an approximation so far from the minimum may lead
+    away. So the likelihood is condensed anew at each step of Levenberg-Marquardt.
     """
     problem = Anew(load, at_knots)
     search = LevenbergMarquardt(damping=1e-2, steps=STEPS)
@@ -347,6 +402,14 @@ def _next(
     going = decided(best, near.objective, scale, found, last, better, reduced, idle)
     trial, target, promised, settled, idle = going
     return _State(trial, near, target, promised, settled, idle, xp.ones_like(idle))
+
+
+class _Stage(NamedTuple):
+    """Where a part of a search at the knots has ended, and whether it would move on."""
+
+    q: Float[AnyArray, "*row q"]
+    equations: NormalEquations
+    moves: Bool[AnyArray, "*row"]
 
 
 class Decision(NamedTuple):
@@ -423,17 +486,27 @@ def _followed(
         return found, left
     at, scale = near.q, near.objective / load.records.terms
     own = np.arange(at.shape[-1]) < load.gains.owned
-
-    q, every = xp.where(goes[..., None], at, target), np.ones_like(own)
     distant = goes & (promised >= DISTANT * near.objective)
-    problem = _Knots(load, at_knots, near, every)
-    if xp is not np or distant.any():
-        enough = xp.where(distant, ROUGHLY * near.objective, np.inf)
-        alone, first = dataclasses.replace(problem, free=own), LevenbergMarquardt(1e-2, STEPS)
-        q = first(alone, q, alone.equations(q), enough).q
-        here = problem.equations(q)
-    enough = xp.where(goes, (WELL * BEFORE) ** 2 * scale, np.inf)
-    last = LevenbergMarquardt(damping=1e-9, steps=STEPS)(problem, q, here, enough)
+    problem = _Knots(load, at_knots, near)
+
+    def stage(
+        state: _Stage,
+        free: Bool[AnyArray, " q"],
+        damping: Float[AnyArray, ""],
+        enough: Float[AnyArray, "*row"],
+    ) -> _Stage:
+        if xp is np and not np.isfinite(enough).any():
+            return state
+        search = LevenbergMarquardt(damping, STEPS, free=free)
+        found = search(problem, state.q, state.equations, enough)
+        return _Stage(found.q, found.equations, found.moves)
+
+    enough = (
+        xp.where(distant, ROUGHLY * near.objective, np.inf),
+        xp.where(goes, (WELL * BEFORE) ** 2 * scale, np.inf),
+    )
+    stages = xp.stack([own, own | True]), np.array([1e-2, 1e-9]), xp.stack(enough)
+    last = in_turn(stage, _Stage(at, here, ~goes), stages)
     # A fit that did not settle promises everything: it is at no minimum.
     left = xp.where(last.moves, -np.inf, last.equations.objective)
     return xp.where(goes[..., None], last.q, target), left

@@ -32,9 +32,10 @@ The products of the records are summed once, at the knots.
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.circuits.circuit import SkinRC, impedance_at
+from etid.circuits.circuit import AbstractCircuit, SkinRC, impedance_at
+from etid.likelihood.linear import in_turn
 from etid.likelihood.search import Load
-from etid.precision import array_function, namespace
+from etid.precision import array_function, held, namespace
 from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex, power
 
@@ -46,6 +47,7 @@ TIME_SCALES = np.geomspace(1e-3, 1e5, 17)
 
 
 @array_function
+@held
 def starts(load: Load) -> Float[AnyArray, "start *row q"]:
     """Starts of a search, the likeliest first; the others serve where it is far away."""
     if load.gains.source.loaded is None:
@@ -57,9 +59,15 @@ def starts(load: Load) -> Float[AnyArray, "start *row q"]:
         own = _by_harmonics(load)
     xp, z = namespace(own), load.gains.source.mean
     every = xp.concatenate([own, xp.broadcast_to(z, (*own.shape[:-1], z.size))], -1)
-    known = np.isfinite(np.asarray(load.width))
-    known[load.gains.elements :] = False  # only what is known of the elements places a start
+    elements = np.arange(every.shape[-1]) < load.gains.elements
+    known = namespace(load.width).isfinite(load.width) & elements
     return xp.where(known, load.centre, every)
+
+
+def _typical(circuit: AbstractCircuit) -> Float[AnyArray, " element"]:
+    """Logarithms of the typical values of a circuit."""
+    values = circuit.values()
+    return namespace(values).log(values)
 
 
 def _by_harmonics(load: Load) -> Float[AnyArray, "start *row own"]:
@@ -69,8 +77,7 @@ def _by_harmonics(load: Load) -> Float[AnyArray, "start *row own"]:
     b0, b1, a1 = (coefficients[..., i] for i in range(3))
     r_s = b1 / a1
     skin = xp.stack([r_s, b0 - r_s, a1 / RATE / (b0 - r_s)], -1)
-    typical = np.log(np.asarray(circuit.values(), float))
-    level, time = np.asarray(circuit.scaling())
+    typical, (level, time) = _typical(circuit), circuit.scaling()
     if isinstance(circuit, SkinRC):
         usable = (skin > 0).all(-1) & xp.isfinite(skin).all(-1)
         usable = usable[..., None]
@@ -87,7 +94,7 @@ def _by_harmonics(load: Load) -> Float[AnyArray, "start *row own"]:
     first = xp.concatenate([logs, late, rest], -1)
     others = [typical + np.log(factor) * level for factor in LEVELS]
     delays = np.zeros(load.gains.outputs.count)
-    others = [xp.zeros_like(first) + np.concatenate([one, delays]) for one in others]
+    others = [xp.zeros_like(first) + xp.concatenate([one, delays]) for one in others]
     return xp.stack([first, *others[::-1]])
 
 
@@ -109,8 +116,7 @@ def _by_current(
     weight = xp.where(weight, shown, 0.0) / load.gains.frequency
     ratio = xp.where(weight > 0, sizes[0] / xp.where(weight > 0, sizes[1], 1.0), 1.0)
     size = 0.5 * xp.log(ratio)
-    typical = np.log(np.asarray(circuit.values(), float))
-    by_size, by_time = np.asarray(circuit.scaling())
+    typical, (by_size, by_time) = _typical(circuit), circuit.scaling()
     delays, found = xp.zeros((*size.shape[:-1], load.gains.outputs.count)), []
     for scale in TIME_SCALES:
         logs = typical + np.log(scale) * by_time + xp.zeros((*size.shape[:-1], 1))
@@ -137,8 +143,9 @@ def _steiglitz_mcbride(load: Load) -> Float[AnyArray, "*row coefficient"]:
     square, zz_th = omega**2, power(z_th)
     typical = SkinRC()
     b0, a1 = typical.r_s + typical.r_p, RATE * typical.r_p * typical.c_p
-    q = np.stack([b0, typical.r_s * a1, a1, 0.0]) + xp.zeros((*xx.shape[:-1], 4))
-    for _ in range(STEPS):
+    start = np.stack([b0, typical.r_s * a1, a1, 0.0]) + xp.zeros((*xx.shape[:-1], 4))
+
+    def step(q: Float[AnyArray, "*row coefficient"], _: AnyArray) -> AnyArray:
         angle = omega * q[..., 3:]
         v = xy * (xp.cos(angle) + 1j * xp.sin(angle)) - yy
         d = 1 + 1j * (q[..., 2:3] * omega)
@@ -162,5 +169,6 @@ def _steiglitz_mcbride(load: Load) -> Float[AnyArray, "*row coefficient"]:
         determinant = zz * kk - kz**2
         a1, change = (kk * hz - kz * hk) / determinant, (zz * hk - kz * hz) / determinant
         b0, b1 = (h0 - z0 * a1 - k0 * change) / p0, (z0 - z1 * a1 - k1 * change) / p2
-        q = xp.stack([b0, b1, a1, q[..., 3] + change], -1)
-    return q
+        return xp.stack([b0, b1, a1, q[..., 3] + change], -1)
+
+    return in_turn(step, start, [np.arange(STEPS)])

@@ -65,14 +65,14 @@ class Spectrum(Module):
 
 
 def same_unloaded(
-    one: Complex[AnyArray, " harmonic"], other: Complex[AnyArray, " _"]
-) -> Bool[AnyArray, ""] | bool:
+    one: Complex[AnyArray, "*row harmonic"], other: Complex[AnyArray, "*#row _"]
+) -> Bool[AnyArray, "*row"] | bool:
     """Whether the X of two recordings are transforms of the same unloaded record."""
     if one is other:
         return True
-    if one.shape != other.shape:
+    if one.shape[-1] != other.shape[-1]:
         return False
-    return power(one - other).sum() <= ROUNDING**2 * power(other).sum()
+    return power(one - other).sum(-1) <= ROUNDING**2 * power(other).sum(-1)
 
 
 def whole_periods(samples: int, sample_rate: float, pulse_rate: float) -> tuple[int, int]:

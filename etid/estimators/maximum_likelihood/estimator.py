@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
@@ -19,16 +20,15 @@ from etid.estimators.estimator import (
     Description,
 )
 from etid.estimators.judgement import STRAINED
-from etid.estimators.lanes import AbstractLane, Harmonics, HarmonicsWithCurrent
-from etid.estimators.maximum_likelihood import given_driver, load_fit
+from etid.estimators.lanes import AbstractLane, Harmonics, HarmonicsWithCurrent, taken
+from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.maximum_likelihood.profile import Records
-from etid.estimators.maximum_likelihood.rows import fit_rows
+from etid.estimators.maximum_likelihood.rows import fit_one, fit_rows
 from etid.estimators.refined_driver import from_harmonics
 from etid.estimators.score_tests.falling_resistance import NO_FALL
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.likelihood.of_calibrations import MISSING_POLE
+from etid.precision import is_traced
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
@@ -136,22 +136,15 @@ class MaximumLikelihood(AbstractEstimator):
         known: GivenDriver,
         circuit: AbstractCircuit,
     ) -> Fit:
-        """Refine from the best of several starts, jointly with the uncertain part of the driver."""
-        spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
+        """Refine from the best of several starts, jointly with the uncertain part of the driver.
+
+        JAX can transform it; without JAX it is a fit of one row.
+        """
         prior = ElementPrior.of(self.known_elements, circuit)
-        records = Records.of(spectrum)
-        if isinstance(lane, HarmonicsWithCurrent) and not known.by_current:
-            current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
-            records = Records.of(spectrum, current)
-            by_current = dataclasses.replace(spectrum, x=current[0], variance_x=current[1])
-            starts = GivenDriver.measured(known.frequency).starts(by_current, rate, circuit)
-        else:
-            starts = known.starts(spectrum, rate, circuit)
-        load = Load.behind(known, circuit, records, rate, prior)
-        found = load_fit.fit_circuit(load, starts)
-        if known.shape is not None:
-            found = found._replace(inconsistent=found.inconsistent | known.shape.differs(spectrum))
-        return found.judged(circuit, driver.result, str(self), self.bounds, prior)
+        of = driver, known, circuit, str(self), prior, self.bounds
+        if is_traced((lane, driver, known)):
+            return fit_one(jax.tree.map(jnp.asarray, lane), *of)
+        return taken(fit_rows([lane], *of)[0], 0)
 
     def fit_rows(
         self,

@@ -8,9 +8,9 @@ import numpy as np
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
+from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, stacked
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.verdict import judged
+from etid.estimators.maximum_likelihood.verdict import judged, judged_one
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import Gains, Voltage, VoltageAndCurrent
 from etid.likelihood.profile import Records
@@ -21,7 +21,7 @@ from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.likelihood.starts import starts
 from etid.likelihood.unloaded import differs
 from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function
+from etid.precision import array_function, namespace
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
@@ -30,10 +30,9 @@ from etid.signals.harmonics import same_unloaded
 
 def source_of(known: GivenDriver) -> Source:
     """The driver for the likelihood of rows."""
-    known = jax.tree.map(np.asarray, known)
     errors, tolerances, of = None, None, known.errors
     if of is not None:
-        stated = np.asarray((of.told or Instrument()).budgeted())
+        stated = (of.told or Instrument()).budgeted()
         errors = Errors(of.at, of.by_z, of.unstated, of.direct, of.drift, stated)
     if known.faults is not None:
         bending = np.zeros(()), np.zeros(known.mean.size)
@@ -50,44 +49,63 @@ def calibrated(known: GivenDriver) -> Calibrated | None:
     of = known.records
     if of is None or known.gains is None or known.gain_slopes is None:
         return None
-    numbers = of.x, of.y, of.variance_y, of.selected, known.gains, known.gain_slopes
-    return Calibrated(*map(np.asarray, numbers))
+    return Calibrated(of.x, of.y, of.variance_y, of.selected, known.gains, known.gain_slopes)
 
 
-def loads_of(
-    lanes: Sequence[Harmonics],
+@array_function
+def load_of(
+    lane: Harmonics,
     source: Source,
     circuit: AbstractCircuit,
     prior: ElementPrior | None,
     shared: Calibrated | None,
 ) -> Load:
-    """The recordings, all of equal length and rates."""
-
-    def stacked(name: str) -> np.ndarray:
-        return np.stack([np.asarray(getattr(lane, name)) for lane in lanes])
-
-    y, variance_y, used = (stacked(name)[:, None] for name in ("y", "variance_y", "selected"))
-    frequency, outputs = stacked("frequency"), Voltage()
-    if isinstance(lanes[0], HarmonicsWithCurrent) and source.loaded is not None:
+    """One recording, or several with equal rates along leading axes."""
+    xp, source_mean = namespace(lane.x), source.mean
+    each = lane.y, lane.variance_y, lane.selected
+    y, variance_y, used = (of[..., None, :] for of in each)
+    outputs = Voltage()
+    if isinstance(lane, HarmonicsWithCurrent) and source.loaded is not None:
         outputs = VoltageAndCurrent()
-        y = np.concatenate([y, stacked("i")[:, None]], axis=1)
-        variance_y = np.concatenate([variance_y, stacked("variance_i")[:, None]], axis=1)
-        used = np.repeat(used, 2, axis=1)
-    records = Records(frequency, stacked("x"), stacked("variance_x"), y, variance_y, used)
-    gains = Gains(source, circuit, frequency, float(lanes[0].sample_rate), outputs)
+        y = xp.stack([lane.y, lane.i], -2)
+        variance_y = xp.stack([lane.variance_y, lane.variance_i], -2)
+        used = xp.stack([lane.selected, lane.selected], -2)
+    records = Records(lane.frequency, lane.x, lane.variance_x, y, variance_y, used)
+    rate = lane.sample_rate.reshape(-1)[0]
+    gains = Gains(source, circuit, lane.frequency, rate, outputs)
     unloaded = None
     if shared is not None and shared.x.shape[-1] == records.x.shape[-1]:
-        same = [[bool(same_unloaded(x, one)) for one in shared.x] for x in records.x]
-        unloaded = Unloaded.by(shared, records, np.array(same))
+        same = same_unloaded(records.x[..., None, :], shared.x)
+        unloaded = Unloaded.by(shared, records, same)
     count = gains.elements
     own = np.zeros(count), np.full(count, np.inf)
     if prior is not None:
-        own = np.asarray(prior.centre), np.asarray(prior.width)
-    others = np.full(gains.outputs.count - 1, DELAY_WIDTH)
-    z = np.ones(source.mean.size)
-    centre = np.concatenate([own[0], np.zeros(gains.outputs.count), source.mean])
-    width = np.concatenate([own[1], [float(source.delay_width)], others, z])
+        own = prior.centre, prior.width
+    others = np.full(outputs.count - 1, DELAY_WIDTH)
+    xp = namespace(source_mean, source.delay_width)
+    centre = xp.concatenate([own[0], np.zeros(outputs.count), source_mean])
+    delay = xp.reshape(source.delay_width, 1)
+    width = xp.concatenate([own[1], delay, others, np.ones(source_mean.size)])
     return Load(gains, records, centre, width, unloaded)
+
+
+@array_function
+def fit_one(
+    lane: Harmonics,
+    driver: AbstractFeed,
+    known: GivenDriver,
+    circuit: AbstractCircuit,
+    method: str,
+    prior: ElementPrior | None = None,
+    bounds: Limits = (),
+) -> Fit:
+    """The fit of a recording by JAX, which can transform it."""
+    load = load_of(lane, source_of(known), circuit, prior, calibrated(known))
+    found = fit(load, starts(load), known.aside)
+    if known.shape is not None:
+        changed = differs(known.shape, load.records)
+        found = found._replace(inconsistent=found.inconsistent | changed)
+    return judged_one(found, circuit, driver.result, method, bounds, prior)
 
 
 @one_thread()
@@ -102,14 +120,14 @@ def fit_rows(
     bounds: Limits = (),
 ) -> list[Fit]:
     """The fits of recordings of equal length and rates, in chunks that are stacked."""
+    known = jax.tree.map(np.asarray, known)
     source, shared, found = source_of(known), calibrated(known), []
-    shape = None if known.shape is None else jax.tree.map(np.asarray, known.shape)
     for first in range(0, len(lanes), ROWS):
-        load = loads_of(lanes[first : first + ROWS], source, circuit, prior, shared)
+        load = load_of(stacked(lanes[first : first + ROWS]), source, circuit, prior, shared)
         estimate = fit(load, starts(load), float(known.aside))
         changed = np.zeros(len(load.records.x), bool)
-        if shape is not None:
-            changed = differs(shape, load.records)
+        if known.shape is not None:
+            changed = differs(known.shape, load.records)
         count = load.gains.elements
         told = np.exp(load.centre[:count]) if prior is None else np.asarray(prior.told)
         of = circuit, driver.result, changed, method, told, load.width[:count], bounds

@@ -8,13 +8,15 @@ data, the data do not determine the parameters.
 import dataclasses
 
 import numpy as np
+import optimistix as optx
 from jaxtyping import Bool, Float
 
 from etid.circuits.branches import exchangeable, in_order
 from etid.circuits.circuit import AbstractCircuit, too_steep
+from etid.estimators import judgement
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
-from etid.estimators.element_prior import FIXED
-from etid.estimators.judgement import STRAINED, SUCCESSFUL, misses
+from etid.estimators.element_prior import FIXED, ElementPrior
+from etid.estimators.judgement import STRAINED, SUCCESSFUL, misses, unless
 from etid.likelihood.fit import Estimate
 from etid.likelihood.linear import diagonal
 from etid.recordings.remarks import Remark
@@ -103,6 +105,39 @@ def judged(
         limits=_limits(circuit, own, outside, len(values)),
         by_tolerance=found.effects,
     )
+
+
+def judged_one(
+    found: Estimate,
+    circuit: AbstractCircuit,
+    driver: RESULTS,
+    method: str,
+    bounds: Limits,
+    prior: ElementPrior | None,
+) -> Fit:
+    """The same of one estimate by JAX; for the arguments see `judgement.judged`."""
+    settled = optx.RESULTS.where(
+        found.settled, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+    )
+    estimate = judgement.Estimate(
+        parameters=found.logs,
+        delay_samples=found.delays,
+        cov=found.cov,
+        chi2=found.chi2,
+        rrse=found.rrse,
+        result=settled,
+        steps=found.points,
+        shared_cov=found.shared_cov,
+        strain=found.strain,
+        hum=found.hum,
+        falls=found.falls,
+        doubtful=found.doubtful,
+        support=found.support,
+        by_tolerance=found.effects,
+    )
+    fit = judgement.judged(estimate, circuit, driver, method, bounds, prior)
+    fit = unless(fit, found.inconsistent, RESULTS.inconsistent)
+    return unless(unless(fit, found.far, RESULTS.driver_unclear), found.other, RESULTS.misfit)
 
 
 def _limits(
