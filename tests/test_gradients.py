@@ -1,7 +1,6 @@
 """Derivatives through a fit: implicit, against differences of fits and against what must be."""
 
 import contextlib
-import dataclasses
 
 import equinox as eqx
 import jax
@@ -13,27 +12,33 @@ import etid
 from benchmarks.perturbed_study import drawn_driver
 from etid.estimators import lanes
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood import search
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.identify import samples
+from etid.likelihood import search
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, HarmonicDriver
 from etid.signals.noise import noise, noise_of
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
-from etid.solvers import successive
 
-# Minima to ten digits: a difference of two of them is to be compared.
-EXACT = dataclasses.replace(search.WELL, rtol=1e-10, ftol=1e-15)
 STEP = 1e-3  # of a disturbance that is small itself: the curvature costs its square
 # Differences of minima along the flat direction of the driver repeat to some 1e-9 of an element.
 REPEATED = 1e-8
 
 
+@pytest.fixture
+def exact(monkeypatch):
+    """Minima to a millionth of a standard error: a difference of two of them is to be compared."""
+    monkeypatch.setattr(search, "BEFORE", 1e-6)
+    monkeypatch.setattr(search, "ROUNDING", 0.0)
+    jax.clear_caches()  # of programs with the other numbers
+    yield
+    jax.clear_caches()
+
+
 @pytest.mark.slow
-def test_a_resistor_follows_the_data_and_the_known_resistor_one_to_one(monkeypatch):
-    monkeypatch.setattr(search, "WELL", EXACT)
-    monkeypatch.setattr(successive, "BEFORE", 1e-6)
+@pytest.mark.usefixtures("exact")
+def test_a_resistor_follows_the_data_and_the_known_resistor_one_to_one():
     known = (Trial("c", ResistorLoad(98.8e3)),)
     scene = Scene((Trial("a", ResistorLoad(55.2e3)),), known, sample_rate=40e3, samples=2000)
     study = scene.simulate(seed=1)
@@ -68,13 +73,12 @@ def test_a_resistor_follows_the_data_and_the_known_resistor_one_to_one(monkeypat
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("exact")
 def test_derivatives_by_both_records_are_differences_of_fits(monkeypatch):
     """In directions of white noise, whose effect is a standard error, with the noise held.
 
     A derivative of the estimate of the noise would count: it is that of a median, and so far off.
     """
-    monkeypatch.setattr(search, "WELL", EXACT)
-    monkeypatch.setattr(successive, "BEFORE", 1e-6)
     held = []
 
     def known(v, step):

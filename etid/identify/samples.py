@@ -14,7 +14,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method
 from etid.identify.arguments import require
 from etid.identify.fitting import skin_lane
 from etid.identify.options import Options, candidates_of, check_default
-from etid.precision import in_float64, untraced
+from etid.precision import in_float64, namespace, untraced
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
@@ -56,7 +56,7 @@ def identify_samples(
             pulses.
 
     Returns:
-        Elements, standard errors and verdict, as arrays that JAX can trace.
+        Elements, standard errors and verdict; arrays of NumPy unless JAX traces the call.
 
     Raises:
         ValueError: The method cannot use this driver or this circuit.
@@ -83,7 +83,8 @@ def identify_samples(
     )
     fit = skin_lane(lane, driver, known, options.circuit, estimator)
     # No harmonic is left out here, so a remark about hum would be untrue.
-    return dataclasses.replace(fit, remarks=fit.remarks & ~int(Remark.mains_hum))
+    remarks = fit.remarks & ~int(Remark.mains_hum)
+    return dataclasses.replace(fit, remarks=namespace(remarks).asarray(remarks))
 
 
 def _default(driver: Driver, periods: int) -> AbstractEstimator:

@@ -26,7 +26,7 @@ SMALLEST = 1e-12  # the same for an inverse
 GOOD = 0.75  # of the reduction that a step promises, from which on the next is damped less
 LEAST = 1e-12  # damping after a step that failed, at least
 ACCELERATION = 0.75  # largest second-order part relative to the step (Transtrum and Sethna)
-LEFT = 1e-5  # of a right side, which its solution may leave
+LEFT = 1e-7  # of a right side, which its solution may leave
 PRODUCTS = 50  # largest number of products for a solution; it takes two or three
 DIFFERENCE = 0.1  # of a step, for its second derivative (ibid.)
 

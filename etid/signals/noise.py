@@ -279,7 +279,7 @@ class Measurement(Module):
     v_out: Float[Array, "*lane time"]
     sigma_th: Float[Array, "*lane"]
     sigma_out: Float[Array, "*lane"]
-    sample_rate: Float[Array, "*lane"]
+    sample_rate: Float[Array | np.ndarray, "*lane"]
 
 
 def floor(
