@@ -1,5 +1,7 @@
 """`identify_samples` runs one text in NumPy and in JAX, and in programs for accelerators."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,7 @@ from etid.circuits.circuit import SkinRC
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
-RATES = {"sample_rate": 200e3, "pulse_rate": 60.0}
+RATES: dict[str, Any] = {"sample_rate": 200e3, "pulse_rate": 60.0}
 SAME = 1e-6  # standard errors: rounding on the way to a minimum
 ROWS = 4096  # of a call that is worth an accelerator
 SKINS = SkinRC(33.4e3, 186e3, 0.12e-9), SkinRC(6.1e3, 17.4e3, 0.66e-9), SkinRC(20e3, 400e3, 60e-12)
