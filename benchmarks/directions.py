@@ -17,8 +17,8 @@ from benchmarks import perturbed_study as lab
 from benchmarks.runner import WORKERS, Target, each, option, report
 from etid.circuits.circuit import SkinRC
 from etid.circuits.directions import DIRECTIONS, FALSE_ALARMS
-from etid.estimators.lanes import Harmonics, stacked
-from etid.estimators.maximum_likelihood.rows import load_of, source_of
+from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood.rows import loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
 from etid.likelihood.fit import fit
@@ -46,7 +46,7 @@ def scores_of(number: int, snr_db: float, parts: float) -> dict[str, dict[str, l
     for one in of.loaded.recordings():
         lane = Harmonics.of(Inspected(one))
         known = known_of(lane, driver, False, MAXIMUM_LIKELIHOOD)
-        load = load_of(stacked([lane]), source_of(known), SkinRC(), None, None)
+        load = loads_of([lane], source_of(known), SkinRC(), None, None)
         scores = fit(load, starts(load)).tested
         found[str(one.path)] = {
             name: [np.nan_to_num(of.z[0]).tolist(), DIRECTIONS[name].seen(*of[:3])[0].tolist()]

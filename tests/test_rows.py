@@ -9,8 +9,8 @@ import pytest
 
 import etid
 from etid.circuits.circuit import SkinLayers, SkinRC
-from etid.estimators.lanes import Harmonics, stacked
-from etid.estimators.maximum_likelihood.rows import load_of, source_of
+from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood.rows import loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
 from etid.likelihood.fit import fit
@@ -46,7 +46,7 @@ def lanes(study):
 def loads(study, driver, circuit=None, rows=slice(None)):
     every = lanes(study)
     known = known_of(every[0], driver, False, MAXIMUM_LIKELIHOOD)
-    return load_of(stacked(every[rows]), source_of(known), circuit or SkinRC(), None, None)
+    return loads_of(every[rows], source_of(known), circuit or SkinRC(), None, None)
 
 
 def in_jax(load):

@@ -29,10 +29,10 @@ from jaxtyping import Bool, Float
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_limits import Limits, of_circuit
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, stacked, taken
+from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, taken
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.rows import calibrated, load_of, source_of
+from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.fitting import fits_of, is_shared, known_of
@@ -90,7 +90,7 @@ class Minimum(NamedTuple):
     def of(cls, lane: Harmonics, known: Known, circuit: AbstractCircuit) -> "Minimum":
         """The minimum near a fitted circuit."""
         driver = source_of(known.driver), circuit, known.elements, calibrated(known.driver)
-        load = load_of(stacked([lane]), *driver)
+        load = loads_of([lane], *driver)
         delays = np.zeros(load.gains.outputs.count)
         start = np.concatenate([np.log(circuit.values()), delays, load.gains.source.mean])
         found = minimum(load, start[None, None])

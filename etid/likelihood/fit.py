@@ -6,14 +6,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from etid.circuits.directions import ON_LOADS, SEEN
+from etid.circuits.directions import DIRECTIONS, ON_LOADS, SEEN
 from etid.likelihood import scores
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.linear import diagonal, inverse
 from etid.likelihood.noise import excess, shows_hum
 from etid.likelihood.profile import rrse
 from etid.likelihood.scores import Linear, Scores
-from etid.likelihood.search import Load, Minimum, minimum
+from etid.likelihood.search import Load, Minimum, Near, minimum
 from etid.likelihood.source import Errors
 from etid.precision import array_function, held, namespace
 from etid.results.fit import Support
@@ -87,8 +87,63 @@ def fit(
     Under JAX elements and delays have derivatives, and nothing else.
     """
     least = minimum(load, starts, aside)
-    logs, delays, _ = load.gains.split(least.q)
-    return _estimate(load, least)._replace(logs=logs, delays=delays)
+    logs, delays, z = load.gains.split(least.q)
+    return _estimate(load, least)._replace(logs=logs, delays=delays, z=z)
+
+
+class _Tested(NamedTuple):
+    """The terms near a point, and the scores of changes of the gains.
+
+    Attributes:
+        share: Share of signal in the power of X.
+        noise: Variances of the innovations, relative to those expected.
+        private: Means of the part of them that only the recording has, for each term.
+        linear: The terms.
+        changes: The changes of each of `scored`.
+        each: Their scores.
+    """
+
+    share: Float[AnyArray, "*row bin"]
+    noise: Float[AnyArray, "*row output bin"]
+    private: Float[AnyArray, "*row part"]
+    linear: Linear
+    changes: dict[str, AnyArray]
+    each: dict[str, Scores]
+
+    @classmethod
+    def of(cls, load: Load, near: Near) -> "_Tested":
+        """The tests of a load near a point, which need not be a minimum."""
+        q, xp, gains = near.q, namespace(near.q), load.gains
+        records, profile, condensed = load.known(q), near.profile, near.condensed
+        share = signal_share(profile.x, records.variance_x)
+        noise = excess(profile.squares, records.used)
+        # All noise is that of a recording alone, or that of its outputs if V_th is shared.
+        private = noise if load.unloaded is None else noise * records.variance_y / profile.expected
+        values = xp.stack([xp.broadcast_to(share[..., None, :], noise.shape), noise, private], -3)
+        means = condensed.means([profile], load.knots, values)
+        precision = 1 / load.width**2
+        linear = Linear.of(
+            near.jacobian,
+            means[..., :2, :],
+            condensed.part,
+            precision * (q - load.centre),
+            _block(precision[: gains.owned], gains.source.cov),
+            precision,
+        )
+        changes = scores.changes(load, near)
+        rows = {name: condensed.rows(of) for name, of in changes.items()}
+        each = scores.of_changes(linear, rows, gains.elements)
+        return cls(share, noise, means[..., 2, :], linear, changes, each)
+
+
+@held
+@array_function
+def shows_other_circuit(load: Load, q: Float[AnyArray, "*row q"]) -> Bool[AnyArray, "*row"]:
+    """Whether loads are other circuits than theirs with q, which need not be a minimum."""
+    near = Near.of(load, load.gains.at(load.knots.index), q)
+    seen = scores.seen(_Tested.of(load, near).each)
+    of_circuit = {name: on for name, on in seen.items() if DIRECTIONS[name].of_circuit}
+    return scores.verdicts(of_circuit)[0]
 
 
 @held
@@ -99,28 +154,9 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
     every, at_knots = load.knots, gains.at(load.knots.index)
     # Standard errors and tests are those of the last point; they do not change in a short step.
     near, at = least.near, least.near.q
-    records = load.known(at)
-    profile, condensed = near.profile, near.condensed
-    share = signal_share(profile.x, records.variance_x)
-    noise = excess(profile.squares, records.used)
-    # All noise is that of a recording alone, or that of its outputs if V_th is shared.
-    private = noise if load.unloaded is None else noise * records.variance_y / profile.expected
-    values = xp.stack([xp.broadcast_to(share[..., None, :], noise.shape), noise, private], -3)
-    means = condensed.means([profile], every, values)
-    mean_noise, mean_private = means[..., 1, :], means[..., 2, :]
-    precision = 1 / load.width**2
-    spread = _block(precision[:owned], source.cov)
-    linear = Linear.of(
-        near.jacobian,
-        means[..., :2, :],
-        condensed.part,
-        precision * (at - load.centre),
-        spread,
-        precision,
-    )
-    changes = scores.changes(load, near)
-    rows = {name: condensed.rows(of) for name, of in changes.items()}
-    each = scores.of_changes(linear, rows, e)
+    records, profile = load.known(at), near.profile
+    share, noise, mean_private, linear, changes, each = _Tested.of(load, near)
+    mean_noise, precision = linear.noise, 1 / load.width**2
     gain, spreads, layer = (each[name].of_changes(0) for name in ("gain", "spread", "layer"))
     added = scores.falling(near, every)
     each["falling"] = scores.rough(linear, added, near, every, share, noise, e)

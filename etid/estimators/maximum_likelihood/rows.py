@@ -1,17 +1,20 @@
 """Loads fitted as rows of arrays, by `etid.likelihood`, behind a driver that is given."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, stacked
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.verdict import judged, judged_one
-from etid.likelihood.fit import fit
+from etid.likelihood.calibrations import Calibrations
+from etid.likelihood.fit import fit, shows_other_circuit
 from etid.likelihood.gains import Gains, Voltage, VoltageAndCurrent
 from etid.likelihood.profile import Records
 from etid.likelihood.search import ROWS, Load
@@ -22,10 +25,13 @@ from etid.likelihood.starts import starts
 from etid.likelihood.unloaded import differs
 from etid.numpy_tier.algebra import one_thread
 from etid.precision import array_function, namespace
+from etid.results.driver import HarmonicDriver
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
 from etid.signals.harmonics import same_unloaded
+from etid.signals.transfer import AnyArray
+from etid.solvers.matrices import root
 
 
 def source_of(known: GivenDriver) -> Source:
@@ -89,6 +95,11 @@ def load_of(
     return Load(gains, records, centre, width, unloaded)
 
 
+def loads_of(lanes: Sequence[Harmonics], *of: Any) -> Load:
+    """Recordings as rows; the other arguments are those of `load_of`."""
+    return load_of(stacked(lanes), *of)
+
+
 @array_function
 def fit_one(
     lane: Harmonics,
@@ -108,6 +119,26 @@ def fit_one(
     return judged_one(found, circuit, driver.result, method, bounds, prior)
 
 
+def other_circuit_at(
+    lane: Harmonics,
+    own: Float[AnyArray, " own"],
+    circuit: AbstractCircuit,
+    driver: HarmonicDriver,
+) -> Bool[AnyArray, ""]:
+    """Whether the harmonics show another circuit than one that was fitted by another criterion.
+
+    Z_th varies within its covariance. The elements need not be at a minimum, because the part of
+    the residual that they could still explain is projected out.
+    """
+    calibrations, deviations = Calibrations.of(driver), root(driver.later_cov())
+    xp, common, count = namespace(own), calibrations.start(), deviations.shape[1]
+    directions = xp.pad(deviations, ((0, common.size - count), (0, 0)))
+    z, unit = np.zeros(count), np.eye(count)
+    known = around(calibrations, common, directions, lane.frequency, False, z, unit)
+    load = load_of(lane, source_of(known), circuit, None, None)
+    return shows_other_circuit(load, xp.concatenate([own, z]))
+
+
 @one_thread()
 @array_function
 def fit_rows(
@@ -123,7 +154,7 @@ def fit_rows(
     known = jax.tree.map(np.asarray, known)
     source, shared, found = source_of(known), calibrated(known), []
     for first in range(0, len(lanes), ROWS):
-        load = load_of(stacked(lanes[first : first + ROWS]), source, circuit, prior, shared)
+        load = loads_of(lanes[first : first + ROWS], source, circuit, prior, shared)
         estimate = fit(load, starts(load), float(known.aside))
         changed = np.zeros(len(load.records.x), bool)
         if known.shape is not None:

@@ -16,12 +16,11 @@ from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import CHECKED, DETERMINED, AbstractEstimator, Description
 from etid.estimators.judgement import MISFIT_CHI2, judged, misses, unless
 from etid.estimators.lanes import PaddedSamples
-from etid.estimators.maximum_likelihood.load_fit import other_circuit_at
+from etid.estimators.maximum_likelihood.rows import other_circuit_at
 from etid.estimators.output_error import fit, prediction
 from etid.estimators.refined_driver import from_samples
 from etid.estimators.starts import circuit_starts, current_starts
 from etid.estimators.steiglitz_mcbride import iteration
-from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
@@ -115,9 +114,8 @@ class OutputError(AbstractEstimator):
             # would take the error of output error, three standard errors, for a relaxation.
             if lane.harmonics is None:
                 return found
-            own = LoadUnknowns(estimate.parameters, estimate.delay_samples[0])
-            spectrum = lane.harmonics.spectrum
-            other = other_circuit_at(spectrum, own, m.sample_rate, fitted, driver)
+            own = jnp.append(estimate.parameters, estimate.delay_samples[0])
+            other = other_circuit_at(lane.harmonics, own, fitted, driver)
         return unless(found, other, RESULTS.misfit)
 
     def describe(self) -> Description:

@@ -253,7 +253,7 @@ def skin_filter(
     return iterate(in_time((v_th - v_out)[None], w[None], 1, 1), 1, 1, assess, iterations)
 
 
-def skin_elements(z_bio: Rational, sample_rate: float | Float[Array, ""]) -> SkinRC:
+def skin_elements(z_bio: Rational, sample_rate: Float[AnyArray, ""] | float) -> SkinRC:
     """Elements of the first-order discrete Z_bio under the bilinear map (paper, eqs. 10-12).
 
     R_s = Z(∞),   R_p = Z(0) − R_s,   C_p from |Z(j/(R_p C_p))| = √((R_s+R_p)² + R_s²) / √2
