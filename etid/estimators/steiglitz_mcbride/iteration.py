@@ -32,6 +32,7 @@ from etid.results.fit import complex_rrse, rrse
 from etid.signals.filtering import lfilter
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import (
+    AnyArray,
     Rational,
     add_polynomials,
     as_complex,
