@@ -142,8 +142,9 @@ def shows_other_circuit(load: Load, q: Float[AnyArray, "*row q"]) -> Bool[AnyArr
     """Whether loads are other circuits than theirs with q, which need not be a minimum."""
     near = Near.of(load, load.gains.at(load.knots.index), q)
     seen = scores.seen(_Tested.of(load, near).each)
-    of_circuit = {name: on for name, on in seen.items() if DIRECTIONS[name].of_circuit}
-    return scores.verdicts(of_circuit)[0]
+    rows = [(DIRECTIONS[name], on) for name, on in seen.items()]
+    other = [on for row, on in rows if row.of_circuit and row.verdict == "misfit"]
+    return namespace(q).stack(other, -1).any(-1)
 
 
 @held
