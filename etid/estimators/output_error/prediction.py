@@ -64,7 +64,7 @@ def prepare(
     rows = jnp.arange(held.shape[0])
     last = held.shape[0] if samples is None else samples - 2 * TAPS + 1
     used = (rows < last).astype(held.dtype)
-    return Records(held, delayed, m.sigma_th, m.sigma_out, m.sample_rate, used)
+    return Records(held, delayed, m.sigma_th, m.sigma_out, jnp.asarray(m.sample_rate), used)
 
 
 def loaded_filter(
