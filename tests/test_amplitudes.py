@@ -4,8 +4,6 @@ The truth is a differential equation of the skin under a current source, solved 
 in time; harmonic balance and fits know nothing of it.
 """
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,6 +18,7 @@ from etid.circuits.current_dependent import Norton, Signals, port
 from etid.estimators.amplitudes.fit import _equations
 from etid.estimators.amplitudes.terms import Amplitudes, with_filter
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.rows import source_of
 from etid.identify.amplitudes import leaves_much
 from etid.numpy_tier import tiers
 from etid.recordings.preflight import Inspected
@@ -167,9 +166,9 @@ def test_terms_and_their_slopes_agree_with_steps_in_time():
     r_th, g, omega = jnp.log(12e3), jnp.array([20e3]), jnp.log(jnp.array([1 / 0.2e-3]))
     source = SourceImpedance(r_th, none, none, none, none, omega, g)
     object.__setattr__(feed, "source", source)
-    known = GivenDriver.measured(jnp.asarray(f))
+    known = source_of(GivenDriver.measured(jnp.asarray(f)))
     loaded = jnp.asarray(source.response(f)) + 50e3
-    known = dataclasses.replace(known, loaded=loaded, resistance=jnp.array(50e3), by_current=False)
+    known = known._replace(loaded=loaded, resistance=jnp.array(50e3))
     of = Amplitudes(
         given=with_filter(known),
         feed=feed,

@@ -19,6 +19,7 @@ from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.rows import source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import check_alike, check_distinct, circuit_of, driver_of, fed
 from etid.identify.arguments import recordings as list_of
@@ -68,7 +69,7 @@ def _fit(
     bounds: Limits,
 ) -> Fit:
     rate = jnp.asarray(lanes.sample_rate)[0]
-    of = Amplitudes(with_filter(known), feed, circuit, lanes.spectrum, rate, prior)
+    of = Amplitudes(with_filter(source_of(known)), feed, circuit, lanes.spectrum, rate, prior)
     estimate = fit_amplitudes(of)
     fit = judgement.judged(estimate, circuit, feed.result, METHOD, bounds, prior)
     fit = judgement.unless(fit, leaves_much(estimate.chi2, estimate.rrse), RESULTS.misfit)

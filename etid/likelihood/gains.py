@@ -166,7 +166,12 @@ class Gains:
 
     def __call__(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
         """The gains at all harmonics."""
-        at, (_, delays, z) = self.impedance(q), self.split(q)
+        cycles = -self.split(q)[1] * (self.frequency[..., :1] / self.sample_rate)
+        return self.undelayed(q) * turns(cycles, self.frequency.shape[-1])
+
+    def undelayed(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
+        """The same without the delays."""
+        at, z = self.impedance(q), self.split(q)[2]
         faults, place = self._faults(z), At(self.frequency, at)
         for of, size in faults:
             place = place._replace(z=of.of_load(place, size)[0])
@@ -179,8 +184,7 @@ class Gains:
         values = [value for value, *_ in self.outputs(at, current)]
         for of, size in faults:
             values[0] = values[0] * of.factor(place, size) + of.offset(place, size)
-        cycles = -delays * (self.frequency[..., :1] / self.sample_rate)
-        return along_outputs(values) * turns(cycles, self.frequency.shape[-1])
+        return along_outputs(values)
 
     def slopes(self, q: Float[AnyArray, "*row q"]) -> Slopes:
         """The gains and their derivatives, at a few frequencies."""

@@ -20,8 +20,9 @@ from etid.estimators.amplitudes.last_step import last_step
 from etid.estimators.amplitudes.late import follows_late
 from etid.estimators.amplitudes.terms import STILL, Amplitudes
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
-from etid.estimators.maximum_likelihood.profile import Profile
-from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.profile import Records
+from etid.likelihood.search import Load
+from etid.likelihood.starts import starts
 from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum, real_parts
 from etid.signals.transfer import as_complex, power
@@ -98,20 +99,25 @@ def fit_amplitudes(of: Amplitudes) -> Estimate:
 
 
 def _likeliest(of: Amplitudes) -> Float[Array, "record own"]:
-    """The likeliest linear load for each record alone, in the order of `Gains`."""
+    """The likeliest linear load for each record alone, without a delay, in the order of `Gains`."""
 
     def one(spectrum: Spectrum) -> Float[Array, " own"]:
-        gain = of.gain(spectrum)
-        starts = of.given.starts(spectrum, of.sample_rate, of.circuit).log_elements
-        each = jax.vmap(lambda logs: LoadUnknowns(logs, jnp.zeros(())).vector())(starts)
-        return best_start(lambda own: Profile.of_output(spectrum, gain(own)[0]).terms[0], each)
+        of_y = spectrum.y[None], spectrum.variance_y[None], spectrum.selected[None]
+        records = Records(spectrum.frequency, spectrum.x, spectrum.variance_x, *of_y)
+        delay, z = jnp.zeros(1), of.given.mean
+        centre = jnp.concatenate([jnp.zeros(of.elements), delay, z])
+        width = jnp.where(jnp.arange(centre.size) < of.elements, jnp.inf, 1.0)
+        load = Load(of.gain(spectrum), records, centre, width)
+        each = jnp.where(jnp.isinf(width), starts(load), centre)
+        found = load.objective(each)
+        return each[jnp.argmin(jnp.where(jnp.isfinite(found), found, jnp.inf))]
 
     return jax.lax.map(one, of.spectra)
 
 
 def _starts(of: Amplitudes, alone: Float[Array, "record own"]) -> Float[Array, "start q"]:
     """Starts of a fit of all records, from the likeliest linear load of each of them alone."""
-    logs = LoadUnknowns.of(alone).log_elements
+    logs = alone[:, : of.elements]
     if current_dependent(of.circuit.impedance()) is not None:
         size = jnp.sum(power(of.spectra.x), axis=-1)
         ends = logs[jnp.stack([jnp.argmin(size), jnp.argmax(size)])]

@@ -28,7 +28,7 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.amplitudes.terms import Amplitudes
-from etid.estimators.maximum_likelihood.profile import Profile, excess
+from etid.likelihood.noise import excess
 from etid.likelihood.sandwich import Curvature
 from etid.signals.harmonics import ALIASED, Spectrum, real_parts, signal_share
 from etid.signals.transfer import as_complex, power
@@ -99,7 +99,8 @@ def last_step(of: Amplitudes, q: Float[Array, " q"]) -> Step:
         rest = real_parts((noisy.y - around.predicted) * as_complex(weight))
         rest = rest - around.along(real_parts(noisy.x - quiet.x))
         b = jax.vmap(around.solved)(rows)
-        inflated = b * jnp.sqrt(excess(rest, noisy.selected))[None]
+        squares = 0.5 * (rest.reshape(2, -1) ** 2).sum(0)
+        inflated = b * jnp.sqrt(jnp.tile(excess(squares, noisy.selected), 2))[None]
         score = jax.vmap(noise.covariance)(inflated) @ inflated.T
         matrix, where = jnp.zeros((q.size, q.size)), jnp.ix_(acting, acting)
         gradient = jnp.zeros(q.size).at[acting].set(b @ rest)
@@ -128,7 +129,7 @@ def _likeliest(
     change = around.back(around.solved(rest))
     count = spectrum.x.size
     x = spectrum.x + jax.lax.complex(change[:count], change[count:])
-    total = Profile.of_output(spectrum, of.gain(spectrum)(own)[0]).expected[0]
+    total = of.variance(own, spectrum)
     return x, signal_share(x, spectrum.variance_x * spectrum.variance_y / total)
 
 

@@ -1,7 +1,7 @@
 """The terms of one load that was recorded at several amplitudes, and their derivatives.
 
 All records have the same elements and the same driver; each has its own trigger delay. The terms
-are those of `etid.estimators.maximum_likelihood.profile`, but the load need not be linear:
+are those of `etid.likelihood.profile`, but the load need not be linear:
 
     Y_k − V_k(X) e^(−jω_k τ),      V_k(X) = Z_L / (Z_L + Z_th) X_k for a linear load.
 
@@ -16,8 +16,8 @@ unknown weights that all records share,
     Y_k − H_k V_k(X/H) e^(−jω_k τ),      log H = Σ_m s tanh(ε_m/s) log H_m,      ε_m ~ N(0, 1).
 
 ε = 0 is a converter that changes nothing below half its sample rate. The ε are further z, which
-change no Z_th (`etid.estimators.maximum_likelihood.given_driver`). No weight exceeds s: a misfit of
-another cause would raise X/H beyond all bounds.
+change no Z_th (`etid.likelihood.source`). No weight exceeds s: a misfit of another cause would
+raise X/H beyond all bounds.
 
 The weights are constant: a fit gets the variances of the terms from earlier estimates. If they
 followed the parameters, elements with a large gain would explain any residual by the noise of X,
@@ -36,15 +36,15 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import Norton, Port, Signals, current_dependent, port
+from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.gains import Gains
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.profile import Profile
-from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.gains import Gains
+from etid.likelihood.source import Source
+from etid.precision import array_function
 from etid.results.driver import HarmonicDriver
 from etid.results.feed import MeasuredCurrent
 from etid.signals.harmonics import Spectrum, real_parts
-from etid.signals.transfer import as_complex, frequency_variable, reciprocal
+from etid.signals.transfer import as_complex, delayed, frequency_variable, power, reciprocal
 from etid.solvers.harmonic_balance import steady_state, to_time
 
 BEYOND = 2  # harmonics of the balance, as a multiple of those of the records
@@ -60,7 +60,7 @@ class Amplitudes(eqx.Module):
     The unknowns of the solver are the logarithms of the elements, the delays, and z.
 
     Attributes:
-        given: What is given of their feed at the harmonics.
+        given: What is given of their feed at the harmonics (`etid.likelihood.source`).
         feed: Their feed, for other frequencies.
         circuit: Structure of the load and its typical values.
         spectra: The records.
@@ -69,7 +69,7 @@ class Amplitudes(eqx.Module):
         expected: Variances of the terms by the noise; None before the first estimate.
     """
 
-    given: GivenDriver
+    given: Source
     feed: HarmonicDriver | MeasuredCurrent
     circuit: AbstractCircuit
     spectra: Spectrum
@@ -84,7 +84,7 @@ class Amplitudes(eqx.Module):
         """
 
         def one(own: Float[Array, " own"], spectrum: Spectrum) -> Float[Array, " harmonic"]:
-            return Profile.of_output(spectrum, self.gain(spectrum).undelayed(own)[0]).expected[0]
+            return self.variance(own, spectrum)
 
         return dataclasses.replace(self, expected=jax.vmap(one)(own, self.spectra))
 
@@ -130,13 +130,19 @@ class Amplitudes(eqx.Module):
         log_elements, late, z = self.split(q)
 
         def one(late: Float[Array, ""]) -> Float[Array, " own"]:
-            return jnp.concatenate([LoadUnknowns(log_elements, late).vector(), z])
+            return jnp.concatenate([log_elements, late[None], z])
 
         return jax.vmap(one)(late)
 
     def gain(self, spectrum: Spectrum) -> Gains:
         """Linear gain of a record at small currents."""
         return Gains(self.given, self.circuit, spectrum.frequency, self.sample_rate)
+
+    @array_function
+    def variance(self, own: Float[Array, " own"], spectrum: Spectrum) -> Float[Array, " harmonic"]:
+        """Variances of the terms of a record, by the linear gain."""
+        gain = self.gain(spectrum)(own)[0]
+        return spectrum.variance_y + power(gain) * spectrum.variance_x
 
     def source(
         self, own: Float[Array, " own"], spectrum: Spectrum, frequency: Float[Array, " wide"]
@@ -148,7 +154,7 @@ class Amplitudes(eqx.Module):
         if isinstance(self.feed, MeasuredCurrent):
             return Norton(x, jnp.zeros_like(x))
         gain = self.gain(spectrum)
-        near = self.given.z_th(gain.w(gain.split(own)[2]))
+        near = self.given.z_loaded(gain.w(gain.split(own)[2])) - as_complex(self.given.resistance)
         admittance = reciprocal(
             jnp.asarray(self.feed.response(frequency)).at[1 : known + 1].set(near)
         )
@@ -163,17 +169,21 @@ class Amplitudes(eqx.Module):
         number = jnp.arange(BEYOND * known + 1.0).at[0].set(STILL)
         frequency = spectrum.frequency[0] * number
         source = self.source(own, spectrum, frequency)
-        impedance = self.gain(spectrum).impedance(own)
+        impedance = self.load(own)
         at = port(impedance, source, frequency_variable(frequency))
         r = as_complex(jnp.asarray(at.element.r))
         small = at.source.current * reciprocal(1 + at.source.admittance * r)
         return at, jnp.max(jnp.abs(to_time(small, 2 * BEYOND * known)))
 
+    def load(self, own: Float[Array, " own"]) -> AbstractImpedance:
+        """The impedance of the load."""
+        return self.circuit.with_log_values(own[: self.elements]).impedance()
+
+    @array_function
     def loaded(self, own: Float[Array, " own"], spectrum: Spectrum) -> Complex[Array, " harmonic"]:
         """Fourier coefficients of V_out [V], without delay."""
-        gain = self.gain(spectrum)
-        if current_dependent(gain.impedance(own)) is None:
-            return gain.undelayed(own)[0] * spectrum.x
+        if current_dependent(self.load(own)) is None:
+            return self.gain(spectrum).undelayed(own)[0] * spectrum.x
         at, size = self.port(own, spectrum)
         slope = at.element.typical_slope(2 * size)
         signals = Signals(*steady_state(at.element.current, slope, *at.source))
@@ -186,7 +196,7 @@ class Amplitudes(eqx.Module):
         spectrum: Spectrum,
     ) -> Complex[Array, " harmonic"]:
         """`values` with the delay of a record."""
-        return self.gain(spectrum).turned(own, values[None], spectrum.frequency)[0]
+        return delayed(values, spectrum.frequency, own[self.elements], self.sample_rate)
 
     def predicted(
         self, own: Float[Array, " own"], spectrum: Spectrum
@@ -241,15 +251,20 @@ class Amplitudes(eqx.Module):
         return jax.lax.map(one, (jnp.arange(self.count), self.spectra))
 
 
-def with_filter(given: GivenDriver) -> GivenDriver:
+def with_filter(given: Source) -> Source:
     """The same with the weights ε of the anti-alias filters as the last z."""
-    of, more = given.faults, len(CORNERS)
-    return dataclasses.replace(
-        given,
-        slope=jnp.pad(given.slope, ((0, more), (0, 0))),
+    of, more = given.tolerances, len(CORNERS)
+    if of is not None:
+        of = of._replace(
+            faults_by_z=jnp.pad(of.faults_by_z, ((0, more), (0, 0))),
+            bending_by_z=jnp.pad(of.bending_by_z, (0, more)),
+        )
+    return given._replace(
+        by_z=jnp.pad(given.by_z, ((0, more), (0, 0))),
         mean=jnp.pad(given.mean, (0, more)),
         cov=jax.scipy.linalg.block_diag(given.cov, jnp.eye(more)),
-        faults=None if of is None else (of[0], jnp.pad(of[1], ((0, more), (0, 0)))),
+        tolerances=of,
+        errors=None,
     )
 
 
