@@ -7,6 +7,7 @@ Formulas compute in the namespace of their arrays, NumPy or JAX.
 """
 
 import functools
+import threading
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any, NamedTuple, ParamSpec, TypeVar
@@ -22,6 +23,7 @@ Result = TypeVar("Result")
 Tree = TypeVar("Tree")
 
 _NUMPY = (np.ndarray, np.generic, float, int, complex)
+_INSIDE = threading.local()  # whether a thread runs an array function
 
 
 def namespace(*values: Any) -> ModuleType:
@@ -42,9 +44,15 @@ def array_function(function: Callable[Parameters, Result]) -> Callable[Parameter
 
     @functools.wraps(function)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        of_jax = jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow")
-        with np.errstate(all="ignore"), of_jax[0], of_jax[1]:
+        if getattr(_INSIDE, "another", False):  # which has set all this
             return function(*args, **kwargs)
+        of_jax = jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow")
+        _INSIDE.another = True
+        try:
+            with np.errstate(all="ignore"), of_jax[0], of_jax[1]:
+                return function(*args, **kwargs)
+        finally:
+            _INSIDE.another = False
 
     return call
 
@@ -132,7 +140,12 @@ class Kept:
 
 
 class Module(Kept, eqx.Module):
-    """A module of equinox that is `Kept`."""
+    """A module of equinox that is `Kept`.
+
+    Its bound methods are no trees: looking for them at every attribute took a tenth of a fit.
+    """
+
+    __getattribute__ = object.__getattribute__
 
 
 class _Packed(NamedTuple):
