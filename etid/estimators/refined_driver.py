@@ -22,7 +22,6 @@ from etid.likelihood.linear import inverse
 from etid.likelihood.noise import shows_hum
 from etid.likelihood.source_prior import delay_std, delay_width
 from etid.numpy_tier.algebra import one_thread
-from etid.numpy_tier.tiers import program
 from etid.precision import array_function, namespace
 from etid.recordings.remarks import Remark
 from etid.results.driver import Calibration, ContinuousDriver, HarmonicDriver, SourceImpedance
@@ -30,10 +29,9 @@ from etid.results.fit import complex_rrse
 from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals import modal
-from etid.signals.harmonics import Spectrum
 from etid.signals.knots import above_noise, banded
 from etid.signals.noise import Measurement
-from etid.signals.transfer import AnyArray, Rational, power
+from etid.signals.transfer import AnyArray, power
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
@@ -71,7 +69,7 @@ def from_harmonics(
     rate = np.asarray(records.sample_rate)[0]
     bands = banded(spectrum)
     spectra = above_noise(spectrum, bands)
-    baseline = jax.tree.map(np.asarray, _baseline(spectra, r_load, rate, order))
+    baseline = iteration.periodic_driver_filter(spectra, r_load, rate, order).filter
     starts = source_starts(baseline.den, order, rate, r_load.mean())
     first = jax.tree.map(lambda of: of[0], starts)
     calibration = Calibration(r_load, np.zeros(r_load.shape), delay_std(r_load))
@@ -125,13 +123,6 @@ def from_harmonics(
         instrument=instrument,
         missing_pole=statistic,
     )
-
-
-@program
-def _baseline(
-    spectra: Spectrum, r_load: Float[Array, " record"], rate: Float[Array, ""], order: int
-) -> Rational:
-    return iteration.periodic_driver_filter(spectra, r_load, rate, order).filter
 
 
 def from_samples(

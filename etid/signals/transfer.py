@@ -33,10 +33,10 @@ def multiply_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[
     )
 
 
-def add_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[Array, " pq"]:
+def add_polynomials(p: Float[AnyArray, " p"], q: Float[AnyArray, " q"]) -> Float[AnyArray, " pq"]:
     """Add two polynomials given by ascending coefficients."""
-    length = max(p.shape[0], q.shape[0])
-    return jnp.pad(p, (0, length - p.shape[0])) + jnp.pad(q, (0, length - q.shape[0]))
+    xp, length = namespace(p, q), max(p.shape[0], q.shape[0])
+    return xp.pad(p, (0, length - p.shape[0])) + xp.pad(q, (0, length - q.shape[0]))
 
 
 def as_complex(x: Inexact[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
@@ -191,18 +191,18 @@ def poles(a: Float[AnyArray, " order1"]) -> Complex[AnyArray, " order"]:
     return found
 
 
-def is_stable(a: Float[Array, " order1"]) -> Bool[Array, ""]:
+def is_stable(a: Float[AnyArray, " order1"]) -> Bool[AnyArray, ""]:
     """Whether all poles of 1 / (a[0] + a[1] z⁻¹ + …) lie inside the unit circle.
 
     Schur-Cohn step-down recursion (Oppenheim & Schafer, *Discrete-Time Signal Processing*, lattice
     filters): stable if and only if every reflection coefficient is smaller than one in magnitude.
     No eigenvalues are needed, so it runs on every backend. NaN coefficients are not stable.
     """
-    a = a / a[0]
-    stable = jnp.array(True)
+    xp, a = namespace(a), a / a[0]
+    stable = xp.isfinite(a).all()
     for order in range(a.shape[0] - 1, 0, -1):
         k = a[order]
-        stable = stable & (jnp.abs(k) < 1)
+        stable = stable & (xp.abs(k) < 1)
         a = (a[:order] - k * a[order:0:-1]) / (1 - k**2)
     return stable
 

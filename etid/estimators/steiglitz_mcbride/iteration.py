@@ -20,14 +20,18 @@ harmonics of |X N_i − W D_i|² / |D_{i−1}|². No filter runs, so that a step
 one in time. An unstable D_{i−1} needs no reflected poles, because only |D_{i−1}| counts.
 """
 
+import dataclasses
 from collections.abc import Callable
+from types import ModuleType
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import SkinRC
+from etid.precision import namespace
 from etid.results.fit import complex_rrse, rrse
 from etid.signals.filtering import lfilter
 from etid.signals.harmonics import Spectrum
@@ -60,10 +64,10 @@ class Iterate(eqx.Module):
     """
 
     filter: Rational
-    rrse: Float[Array, ""]
-    iteration: Int[Array, ""]
-    converged: Bool[Array, ""]
-    stable: Bool[Array, ""]
+    rrse: Float[AnyArray, ""]
+    iteration: Int[AnyArray, ""]
+    converged: Bool[AnyArray, ""]
+    stable: Bool[AnyArray, ""]
 
 
 def _delayed(v: Float[Array, "record time"], lags: range) -> Float[Array, "record time lag"]:
@@ -78,31 +82,33 @@ def check_iterations(iterations: int) -> None:
         raise ValueError(f"iterations is {iterations}; use at least one")
 
 
-def least_squares(columns: Float[Array, "row column"], poles: int) -> Rational:
-    """N/D by linear least squares.
+def least_squares(columns: Float[AnyArray, "row column"], poles: int) -> Rational:
+    """N/D by linear least squares; NaN if the columns do not determine it.
 
     Args:
         columns: X z⁻ᵏ for each coefficient of N, −W z⁻ᵏ for those of D but the first, and W.
         poles: Order of D.
     """
-    length = jnp.linalg.norm(columns[:, :-1], axis=0)
-    length = jnp.where(length > 0, length, 1.0)
+    xp = namespace(columns)
+    length = xp.linalg.norm(columns[:, :-1], axis=0)
+    length = xp.where(length > 0, length, 1.0)
     # The last column of R holds Qᵀ W; to compute Q itself would double the time.
-    scaled = jnp.concatenate([columns[:, :-1] / length[None, :], columns[:, -1:]], axis=1)
-    r = jnp.linalg.qr(scaled, mode="r")
-    coefficients = jax.scipy.linalg.solve_triangular(r[:-1, :-1], r[:-1, -1]) / length
-    one = jnp.ones(1, columns.dtype)
-    return Rational(coefficients[:-poles], jnp.concatenate([one, coefficients[-poles:]]))
+    scaled = xp.concatenate([columns[:, :-1] / length[None, :], columns[:, -1:]], axis=1)
+    r = xp.linalg.qr(scaled, mode="r")[:-1]
+    square = xp.where((r[:, :-1] == 0) & np.eye(len(r), dtype=bool), np.nan, r[:, :-1])
+    coefficients = xp.linalg.solve(square, r[:, -1:])[:, 0] / length
+    one = xp.ones(1, columns.dtype)
+    return Rational(coefficients[:-poles], xp.concatenate([one, coefficients[-poles:]]))
 
 
-_Carry = tuple[Iterate, Float[Array, " a"]]
+_Carry = tuple[Iterate, Float[AnyArray, " a"]]
 
 
 def iterate(
-    solve: Callable[[Float[Array, " a"]], Rational],
+    solve: Callable[[Float[AnyArray, " a"]], Rational],
     zeros: int,
-    poles: int,
-    assess: Callable[[Rational], Float[Array, ""]],
+    first: Float[AnyArray, " a"],
+    assess: Callable[[Rational], Float[AnyArray, ""]],
     iterations: int = ITERATIONS,
 ) -> Iterate:
     """Fit N/D with X N/D = W over one or several records (eqs. 1, 2).
@@ -110,34 +116,43 @@ def iterate(
     Args:
         solve: Function that returns N_i/D_i, given D_{i−1}.
         zeros: Order of N.
-        poles: Order of D.
+        first: D₋₁.
         assess: Function that returns the RRSE of the voltage that a candidate predicts; infinite
             if its closed loop is unstable.
         iterations: Number of iterations; 1 is equation error.
     """
+    xp = namespace(first)
 
-    def step(carry: _Carry, iteration: Int[Array, ""]) -> tuple[_Carry, Float[Array, ""]]:
+    def step(carry: _Carry, iteration: Int[AnyArray, ""]) -> tuple[_Carry, Float[AnyArray, ""]]:
         best, previous = carry
         candidate = solve(previous)
         error = assess(candidate)
-        change = jnp.linalg.norm(candidate.den - previous) / jnp.linalg.norm(candidate.den)
+        change = xp.linalg.norm(candidate.den - previous) / xp.linalg.norm(candidate.den)
         stable = is_stable(candidate.den)
         current = Iterate(candidate, error, iteration, change < SETTLED, stable)
         # While no iterate can be simulated, keep the latest.
-        better = (error < best.rrse) | ~jnp.isfinite(best.rrse)
-        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), current, best)
-        finite = jnp.isfinite(candidate.den).all()
-        return (best, jnp.where(finite, candidate.den, previous)), change
+        better = (error < best.rrse) | ~xp.isfinite(best.rrse)
+        best = jax.tree.map(lambda new, old: xp.where(better, new, old), current, best)
+        finite = xp.isfinite(candidate.den).all()
+        return (best, xp.where(finite, candidate.den, previous)), change
 
+    no = xp.asarray(False)
     nothing = Iterate(
-        Rational(jnp.zeros(zeros + 1), jnp.zeros(poles + 1).at[0].set(1.0)),
-        jnp.array(jnp.inf),
-        jnp.array(0),
-        jnp.array(False),
-        jnp.array(False),
+        Rational(xp.zeros(zeros + 1), first), xp.asarray(np.inf), xp.asarray(0), no, no
     )
-    (best, _), changes = jax.lax.scan(step, (nothing, nothing.filter.den), jnp.arange(iterations))
-    return eqx.tree_at(lambda b: b.converged, best, changes[-1] < SETTLED)
+    carry, change = (nothing, first), xp.asarray(np.inf)
+    if xp is np:
+        for number in range(iterations):
+            carry, change = step(carry, np.asarray(number))
+    else:
+        carry, changes = jax.lax.scan(step, carry, jnp.arange(iterations))
+        change = changes[-1]
+    return dataclasses.replace(carry[0], converged=change < SETTLED)
+
+
+def no_poles(xp: ModuleType, order: int) -> Float[AnyArray, " order1"]:
+    """D = 1."""
+    return xp.asarray(np.eye(order + 1)[0])
 
 
 def in_time(
@@ -172,9 +187,10 @@ def terminal_voltage(
     return lfilter(forward, safe, v_th)[0], stable
 
 
-def _or_infinite(error: Float[Array, ""], stable: Bool[Array, ""]) -> Float[Array, ""]:
+def _or_infinite(error: Float[AnyArray, ""], stable: Bool[AnyArray, ""]) -> Float[AnyArray, ""]:
     """The error; infinite if it is not finite or the loop is unstable."""
-    return jnp.where(stable & jnp.isfinite(error), error, jnp.inf)
+    xp = namespace(error)
+    return xp.where(stable & xp.isfinite(error), error, np.inf)
 
 
 def driver_filter(
@@ -200,42 +216,44 @@ def driver_filter(
         return jax.vmap(one)(v_th, v_out, r_load).max()
 
     w = r_load[:, None] * (v_th - v_out)
-    return iterate(in_time(v_out, w, order - 1, order), order - 1, order, assess, iterations)
+    solve = in_time(v_out, w, order - 1, order)
+    return iterate(solve, order - 1, no_poles(jnp, order), assess, iterations)
 
 
 def periodic_driver_filter(
     spectra: Spectrum,
-    r_load: Float[Array, " record"],
-    sample_rate: Float[Array, ""],
+    r_load: Float[AnyArray, " record"],
+    sample_rate: Float[AnyArray, ""],
     order: int,
 ) -> Iterate:
     """`driver_filter` from harmonics of the records, stacked."""
-    x, y = (jnp.where(spectra.selected, of, 0.0) for of in (spectra.x, spectra.y))
+    xp = namespace(spectra.x)
+    x, y = (xp.where(spectra.selected, of, 0.0) for of in (spectra.x, spectra.y))
     r = as_complex(r_load)[:, None]
     w = r * (x - y)
     z = delay_variable(spectra.frequency, sample_rate)
-    powers = [jnp.ones_like(z)]
+    powers = [xp.ones_like(z)]
     while len(powers) <= order:
         powers.append(powers[-1] * z)
-    delays = jnp.stack(powers)
-    rows = jnp.concatenate([delays[:-1] * y[None], -delays[1:] * w[None], w[None]])
+    delays = xp.stack(powers)
+    rows = xp.concatenate([delays[:-1] * y[None], -delays[1:] * w[None], w[None]])
     rows = rows.reshape(2 * order + 1, -1)
-    parts = jnp.stack([rows.real, rows.imag], axis=1)
+    parts = xp.stack([rows.real, rows.imag], axis=1)
 
-    def solve(previous: Float[Array, " a"]) -> Rational:
-        den = jnp.tensordot(as_complex(previous), delays, 1).ravel()
-        weighted = parts / jnp.sqrt(power(den))[None, None, :]
+    def solve(previous: Float[AnyArray, " a"]) -> Rational:
+        den = xp.tensordot(as_complex(previous), delays, 1).ravel()
+        weighted = parts / xp.sqrt(power(den))[None, None, :]
         return least_squares(weighted.reshape(parts.shape[0], -1).T, order)
 
-    def assess(candidate: Rational) -> Float[Array, ""]:
-        num = jnp.tensordot(as_complex(candidate.num), delays[:-1], 1)
-        forward = r * jnp.tensordot(as_complex(candidate.den), delays, 1)
+    def assess(candidate: Rational) -> Float[AnyArray, ""]:
+        num = xp.tensordot(as_complex(candidate.num), delays[:-1], 1)
+        forward = r * xp.tensordot(as_complex(candidate.den), delays, 1)
         predicted = forward * reciprocal(forward + num) * x
         closed = [add_polynomials(of * candidate.den, candidate.num) for of in r_load]
-        stable = jnp.stack([is_stable(one) for one in closed]).all()
-        return _or_infinite(jax.vmap(complex_rrse)(predicted, y).max(), stable)
+        stable = xp.stack([is_stable(one) for one in closed]).all()
+        return _or_infinite(complex_rrse(predicted, y).max(), stable)
 
-    return iterate(solve, order - 1, order, assess)
+    return iterate(solve, order - 1, no_poles(xp, order), assess)
 
 
 def skin_filter(
@@ -251,7 +269,8 @@ def skin_filter(
         return _or_infinite(rrse(predicted, v_out), stable)
 
     w = lfilter(z_th.num, z_th.den, v_out)[0]
-    return iterate(in_time((v_th - v_out)[None], w[None], 1, 1), 1, 1, assess, iterations)
+    solve = in_time((v_th - v_out)[None], w[None], 1, 1)
+    return iterate(solve, 1, no_poles(jnp, 1), assess, iterations)
 
 
 def skin_elements(z_bio: Rational, sample_rate: Float[AnyArray, ""] | float) -> SkinRC:
