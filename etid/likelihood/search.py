@@ -37,7 +37,7 @@ from etid.precision import array_function, held, namespace
 from etid.signals.knots import DENSITY, Knots, knots
 from etid.signals.transfer import AnyArray, as_complex, reciprocal
 
-ROWS = 16  # loads side by side: their arrays stay in the cache of a processor
+ROWS = 32  # loads side by side: more leave the cache of a processor, fewer cost calls
 POINTS = 100  # largest number of points; below 24 dB some fits take dozens
 BEFORE = 0.05  # [standard errors] largest distance to the minimum before the last step
 # [standard errors] An approximation errs by a tenth: if a point so near is no better, the best
