@@ -10,17 +10,15 @@ import pathlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.signal
 
 import etid
 from benchmarks import charts, peers
 from benchmarks.machine import median_time, write_csv
-from benchmarks.peers import START, Problem, harmonics, problem, problem_of, terms
+from benchmarks.peers import START, Problem, harmonics, problem, problem_of
 from benchmarks.runner import QUICK, option, show
-from etid.estimators.maximum_likelihood.search import WELL
+from etid.likelihood.search import Near
 
 PINNED = True
 OPTIONS = (QUICK, option("--folder", default=pathlib.Path()))
@@ -48,14 +46,12 @@ def seconds(call: Callable[[], Any]) -> float:
 
 def calls(one: Problem) -> dict[str, Callable[[], Any]]:
     """What is measured against the number of samples, of a single record."""
-    first = jax.tree.map(lambda leaf: leaf[0], one.lanes)
-    start = jnp.asarray(START)
-    harmonic = jax.jit(lambda q, first: WELL.equations(terms, q, one.load(first)))
-    refine = jax.jit(peers.one_fit(one)["ours"])
+    load, refine = one.load(one.lanes), peers.ours(one)
+    knots, start = load.gains.at(load.knots.index), np.tile(START, (len(one.records), 1))
     return peers.filter_calls(one.records[0].v_th) | {
         "harmonics and noise": lambda: harmonics(one.records[0]),
-        "normal equations of the harmonics": lambda: harmonic(start, first),
-        "LM fit on the harmonics": lambda: refine(first),
+        "likelihood and its slopes": lambda: Near.of(load, knots, start),
+        "LM fit on the harmonics": lambda: refine(np.arange(1)),
     }
 
 

@@ -20,17 +20,19 @@ import etid
 from benchmarks.ladder import recorded
 from etid.circuits.circuit import SkinRC
 from etid.estimators.estimate import MAX_STEPS
-from etid.estimators.harmonic_start import start_of_skin
 from etid.estimators.lanes import Harmonics, stacked
-from etid.estimators.maximum_likelihood.gains import Gains
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.maximum_likelihood.profile import Records
-from etid.estimators.maximum_likelihood.search import WELL
+from etid.estimators.maximum_likelihood.rows import load_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.fitting import each, known_of
+from etid.identify.fitting import known_of
+from etid.likelihood.profile import Profile
+from etid.likelihood.search import Load, minimum
+from etid.likelihood.source import Source
+from etid.likelihood.starts import starts
+from etid.precision import array_function
 from etid.recordings.preflight import Inspected
 from etid.signals.filtering import lfilter
+from etid.signals.harmonics import real_parts
+from etid.signals.transfer import as_complex
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.solvers.levenberg_marquardt import normal_equations
 
@@ -70,18 +72,19 @@ class Problem(NamedTuple):
     driver: etid.Driver  # as identified from the calibration
     records: list[etid.Recording]  # the trials
     lanes: Harmonics  # their harmonics, stacked
-    known: GivenDriver  # what the calibration tells at these
+    source: Source  # Z_th as the calibration tells it, without its error
 
-    def load(self, one: Any) -> Load:
-        """A lane with Z_th as it is; calling it gives the terms of elements and delay."""
-        rate = jnp.asarray(one.sample_rate)
-        gains = Gains(self.known, SkinRC(), one.spectrum.frequency, rate)
-        return Load(gains, Records.of(one.spectrum))
+    def load(self, lanes: Any) -> Load:
+        """Lanes with Z_th as it is: elements and delay are unknown."""
+        return load_of(lanes, self.source, SkinRC(), None, None)
 
 
+@array_function
 def terms(own: Float[Array, " own"], load: Load) -> Float[Array, " term"]:
     """What all solvers minimise the squares of."""
-    return load(own)
+    of = Profile.of(load.records, load.gains(own))
+    scaled = (of.innovations * as_complex(jnp.sqrt(of.weight))).ravel()
+    return jnp.concatenate([real_parts(scaled), load.rest(own)])
 
 
 def harmonics(record: etid.Recording) -> Harmonics:
@@ -93,8 +96,15 @@ def problem_of(study: etid.Study, driver: etid.Driver) -> Problem:
     """The same for given recordings."""
     records = list(study.loaded.recordings())
     lanes = [harmonics(record) for record in records]
-    known = jax.device_put(known_of(lanes[0], driver, False, MAXIMUM_LIKELIHOOD))
-    assert isinstance(known, GivenDriver)
+    of = source_of(known_of(lanes[0], driver, False, MAXIMUM_LIKELIHOOD))
+    none = np.zeros(0)
+    known = of._replace(
+        loaded=of.z_loaded(of.w(of.mean, np.zeros(1))),
+        by_z=of.by_z[:0],
+        mean=none,
+        cov=np.diag(none),
+        errors=None,
+    )
     return Problem(study, driver, records, stacked(lanes), known)
 
 
@@ -117,16 +127,16 @@ class ByNumPy:
 
     def __init__(self, load: Load):
         spectrum = load.records
-        used = np.asarray(spectrum.selected[0])
+        used = np.asarray(spectrum.used[0])
         self.x, self.y = np.asarray(spectrum.x)[used], np.asarray(spectrum.y[0])[used]
         self.of_x = np.asarray(spectrum.variance_x)[used]
         self.of_y = np.asarray(spectrum.variance_y[0])[used]
         self.s = 2j * np.pi * np.asarray(spectrum.frequency)[used]
-        driver = load.gains.driver
-        assert isinstance(driver, GivenDriver)
-        self.z_th = np.asarray(driver.z_th(load.gains.w(driver.mean)))[used]
+        source = load.gains.source
+        assert source.loaded is not None
+        self.z_th = (source.loaded - source.resistance)[used]
         self.rate = float(load.gains.sample_rate)
-        self.width = float(load.gains.widths(jnp.zeros(4))[-1])
+        self.width = float(load.width[-1])
 
     def _parts(self, q: np.ndarray):
         r_s, r_p, c_p = np.exp(q[:3])
@@ -156,16 +166,6 @@ class ByNumPy:
         columns = of_weight * e - of_g * self.x * weight
         last = np.array([[0.0, 0.0, 0.0, 1 / self.width]])
         return np.concatenate([columns.real.T, columns.imag.T, last])
-
-
-def _each(one: Callable[[Any], Any], data: Any) -> Run:
-    """Lanes one after the other on a processor, as etid does."""
-
-    @jax.jit
-    def run(data, index):
-        return each(lambda i: one(jax.tree.map(lambda leaf: leaf[i], data)), index, index.size)
-
-    return lambda index: run(data, jnp.asarray(index))
 
 
 def _vmapped(one: Callable[[Any], Any], data: Any) -> Run:
@@ -203,27 +203,29 @@ def numpy_steiglitz_mcbride(
     return num, den
 
 
-def harmonic_steiglitz_mcbride(of: Problem, iterations: int) -> Run:
-    """Our Steiglitz-McBride on the harmonics, a start of fits."""
-    z_th = of.known.z_th(jnp.zeros_like(of.known.loaded))
-
-    def ours(one):
-        return start_of_skin(one.spectrum, z_th, one.sample_rate, iterations)[0].values()
-
-    return _each(ours, of.lanes)
+def harmonic_steiglitz_mcbride(of: Problem) -> Run:
+    """Our Steiglitz-McBride on the harmonics, a start of fits: the elements."""
+    return lambda index: np.exp(starts(of.load(_rows(of, index)))[0, :, :3])
 
 
-def one_fit(of: Problem) -> dict[str, Callable[[Any], Any]]:
-    """Elements and delay of one lane, by each solver in JAX."""
+def ours(of: Problem) -> Run:
+    """Our fits as rows."""
+
+    def run(index: np.ndarray) -> np.ndarray:
+        return minimum(of.load(_rows(of, index)), np.tile(START, (1, len(index), 1))).q
+
+    return run
+
+
+def _rows(of: Problem, index: np.ndarray) -> Harmonics:
+    return jax.tree.map(lambda leaf: leaf[index], of.lanes)
+
+
+def _by_optimistix(of: Problem) -> Callable[[Any], Any]:
+    """Elements and delay of one lane."""
     start, settings = jnp.asarray(START), {"max_steps": MAX_STEPS, "throw": False}
-
-    def by(solver: Any) -> Callable[[Any], Any]:
-        return lambda one: (
-            optx.least_squares(terms, solver, start, args=of.load(one), **settings).value
-        )
-
     stock = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-    return {"ours": by(WELL), "optimistix": by(stock)}
+    return lambda one: optx.least_squares(terms, stock, start, args=of.load(one), **settings).value
 
 
 def _minpack(value: Callable, slope: Any) -> np.ndarray:
@@ -251,11 +253,10 @@ def compiled_scipy_fit(of: Problem) -> Callable[[Any], np.ndarray]:
 
 def solvers(of: Problem) -> dict[str, Run]:
     """One fit per lane, Z_th known, by every solver."""
-    by, lanes = one_fit(of), of.lanes
     return {
-        "ours": _each(by["ours"], lanes),
-        "scipy": _looped(_scipy_fit(of), lanes),
-        "optimistix": _vmapped(by["optimistix"], lanes),
+        "ours": ours(of),
+        "scipy": _looped(_scipy_fit(of), of.lanes),
+        "optimistix": _vmapped(_by_optimistix(of), of.lanes),
     }
 
 

@@ -77,7 +77,7 @@ def from_samples(of: Problem, repeats: int) -> Iterator[Target]:
     ours = median_time(lambda: peers.judged(of)(batch), repeats) / BATCH
     yield costs(f"raw to judged fit / scipy lfilter, {BATCH} lanes", ours, reference, 1.5)
 
-    iterate, truth = peers.harmonic_steiglitz_mcbride(of, ITERATIONS), dataclasses.astuple(LOAD)
+    iterate, truth = peers.harmonic_steiglitz_mcbride(of), dataclasses.astuple(LOAD)
     np.testing.assert_allclose(np.median(iterate(every), axis=0), truth, rtol=0.05)
     on_harmonics = median_time(lambda: iterate(every), repeats) / every.size
     whole = on_harmonics + median_time(lambda: harmonics(record), 5 * repeats)

@@ -6,22 +6,22 @@
 `fit` gives standard errors, score tests and a verdict, for any outputs.
 """
 
-from collections.abc import Sequence
 from typing import ClassVar
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+import numpy as np
 
 import etid
-from etid.estimators.maximum_likelihood.gains import AbstractOutputs, Current
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.maximum_likelihood.load_fit import fit_circuit
-from etid.estimators.maximum_likelihood.profile import Records
+from etid.circuits.elements import resistor
+from etid.circuits.impedance import series
+from etid.estimators.maximum_likelihood.rows import load_with
+from etid.estimators.maximum_likelihood.verdict import judged
+from etid.likelihood.fit import fit as estimated
+from etid.likelihood.gains import AbstractOutputs, Gains
+from etid.likelihood.profile import Records
+from etid.likelihood.starts import starts
 from etid.results.verdicts import verdict
-from etid.signals.harmonics import Spectrum
+
+KNOWN = 47e3  # [Ω]
 
 
 class TwoCurrents(AbstractOutputs):
@@ -29,32 +29,30 @@ class TwoCurrents(AbstractOutputs):
 
     count: ClassVar[int] = 3
 
-    def __call__(self, z_load: Complex[Array, " f"], current: Current) -> Complex[Array, "3 f"]:
-        i = current(z_load)
-        return jnp.stack([z_load * i, i, i])
+    def __call__(self, z_load, current):
+        return [(z_load * current, current, z_load), (current, 0.0, 1.0), (current, 0.0, 1.0)]
 
 
-class KnownInSeries(AbstractOutputs):
-    """The voltage of a load and of a known resistor behind it [Ω], and that of the resistor."""
+class WithKnown(AbstractOutputs):
+    """The voltage of a load with a known resistor behind it, and that of the resistor."""
 
     count: ClassVar[int] = 2
-    known: Float[Array, ""]
 
-    def __call__(self, z_load: Complex[Array, " f"], current: Current) -> Complex[Array, "2 f"]:
-        total = z_load + jax.lax.complex(self.known, 0.0)
-        i = current(total)
-        return jnp.stack([total, jnp.full_like(total, self.known)]) * i[None, :]
+    def __call__(self, z_load, current):
+        return [(z_load * current, current, z_load), (KNOWN * current, 0.0, KNOWN)]
 
 
-@eqx.filter_jit
-def fit(
-    outputs: AbstractOutputs,
-    known: GivenDriver,
-    spectrum: Spectrum,
-    others: Sequence[tuple[Array, Array]],
-    rate: Float[Array, ""],
-) -> etid.Fit:
-    """The skin of a recording, from V_th, V_out and `others` [coefficients and variances]."""
-    load = Load.behind(known, etid.SkinRC(), Records.of(spectrum, *others), rate, None, outputs)
-    found = fit_circuit(load, known.starts(spectrum, rate, etid.SkinRC()))
-    return found.judged(etid.SkinRC(), verdict("successful"), "new data")
+class SkinAndKnown(etid.SkinRC):
+    """Skin in series with the known resistor."""
+
+    def impedance(self):
+        return series(resistor(KNOWN), super().impedance())
+
+
+def fit(gains: Gains, records: Records) -> etid.Fit:
+    """The loads of recordings, side by side."""
+    load, circuit = load_with(gains, records), gains.circuit
+    none, unknown = np.ones(gains.elements), np.full(gains.elements, np.inf)
+    changed = np.zeros(len(records.x), bool)
+    of = circuit, verdict("successful"), changed, "new data", none, unknown
+    return judged(estimated(load, starts(load)), *of)

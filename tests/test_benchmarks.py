@@ -250,9 +250,9 @@ def test_all_peers_solve_the_same_problem():
         np.testing.assert_allclose(elements, found["ours"], atol=1e-4, err_msg=name)
     load = of.load(jax.tree.map(lambda leaf: leaf[0], of.lanes))
     by, q = ByNumPy(load), START + 0.01
-    used = np.concatenate([np.tile(np.asarray(load.records.selected[0]), 2), [False] * 3, [True]])
-    slope = np.asarray(jax.jacfwd(load)(jax.numpy.asarray(q)))[used]
-    terms = np.asarray(load(jax.numpy.asarray(q)))[used]
+    used = np.concatenate([np.tile(load.records.used[0], 2), [False] * 3, [True]])
+    slope = np.asarray(jax.jacfwd(peers.terms)(jax.numpy.asarray(q), load))[used]
+    terms = peers.terms(q, load)[used]
     np.testing.assert_allclose(by.terms(q), terms, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(by.jacobian(q), slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 

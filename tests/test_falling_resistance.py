@@ -1,9 +1,8 @@
 """Score test of a resistance that falls with its current: statistics, false alarms, power."""
 
 import dataclasses
+from types import SimpleNamespace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,7 +10,9 @@ import etid
 from benchmarks.laboratory import SCALE, Record
 from benchmarks.perturbation_list import PERTURBATIONS
 from benchmarks.perturbed_study import nonlinear, undisturbed
-from etid.estimators.score_tests.falling_resistance import added_voltage
+from etid.likelihood.gains import Slopes
+from etid.likelihood.scores import falling
+from etid.likelihood.search import Near
 from etid.recordings.remarks import Remark
 from etid.signals.knots import knots
 
@@ -49,23 +50,24 @@ def test_what_is_added_is_what_a_falling_resistance_adds():
     expected = largest * np.fft.rfft(u - linear, norm="forward")[1 : HARMONICS + 1]
     # The fixed point has a direct voltage, which a charge-balanced pulse has not.
     every = knots(HARMONICS)
-    z = SKIN.response(jnp.asarray(f[1 : HARMONICS + 1]))
-    added = jax.jit(
-        lambda z, i: added_voltage(
-            z * i, every.at(z), jnp.ones((1, every.index.size), complex), every
-        )
-    )
-    found = np.asarray(added(z, current[1 : HARMONICS + 1]))[0] / r_p
+    z = SKIN.response(f[1 : HARMONICS + 1])
+    found = added(z, current[1 : HARMONICS + 1], every)[0] / r_p
     # 2 %: straight lines between the knots, and Z at the last harmonic in the place of R_s.
     assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
 
 
+def added(z, current, every):
+    """What a falling resistance adds behind a source of current, whose gain is Z_L."""
+    at = z[every.index]
+    one = np.ones((1, at.size), complex)
+    slopes = Slopes(at, at[None], one, one, one[None])
+    near = Near(np.zeros(1), np.zeros(()), SimpleNamespace(x=current), None, slopes, None)
+    return falling(near, every)
+
+
 def test_a_resistor_alone_has_no_such_voltage():
     every = knots(200)
-    z = jnp.full(every.index.size, 1e5 + 0j)
-    assert not np.any(
-        jax.jit(lambda v: added_voltage(v, z, z[None], every))(jnp.ones(200, complex))
-    )
+    assert not np.any(added(np.full(200, 1e5 + 0j), np.ones(200, complex), every))
 
 
 def test_skin_that_loses_a_fifth_of_its_resistance_is_a_misfit_at_40_db():

@@ -17,10 +17,12 @@ from etid import cli
 from etid.circuits.circuit import AbstractCircuit, Farad, Ohm, parameter
 from etid.circuits.elements import capacitor, resistor
 from etid.circuits.impedance import parallel, series
-from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import given
+from etid.estimators.maximum_likelihood.rows import source_of
 from etid.likelihood.calibrations import Calibrations
+from etid.likelihood.gains import Gains
 from etid.online.current import CurrentModel
+from etid.precision import array_function
 from etid.recordings.remarks import Remark
 from etid.results.driver import ContinuousDriver, HarmonicDriver
 from etid.results.instrument import ERRORS
@@ -278,11 +280,12 @@ def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax(resistors):
     driver = etid.identify_driver(known, instrument=ALL)
     assert isinstance(driver, HarmonicDriver)
     frequency = driver.spectra.frequency[0]
-    gains = Gains(given(driver, frequency, False), DRY, frequency, jnp.asarray(skin.sample_rate))
-    at = 0.1 * jnp.arange(1.0, 1 + gains.owned + gains.driver.mean.size) / gains.owned
+    source = source_of(given(driver, np.asarray(frequency), False))
+    gains = Gains(source, DRY, np.asarray(frequency), skin.sample_rate)
+    at = 0.1 * jnp.arange(1.0, 1 + gains.owned + source.mean.size) / gains.owned
     q = at.at[: gains.elements].set(DRY.log_values())
-    found = jnp.moveaxis(jax.jit(lambda q: gains.slopes(q).by_unknown)(q), 0, -1)
-    wanted = jax.jit(jax.jacfwd(lambda q: gains(q)))(q)
+    found = jnp.moveaxis(jax.jit(array_function(lambda q: gains.slopes(q).by_q))(q), 0, -1)
+    wanted = jax.jit(jax.jacfwd(array_function(lambda q: gains(q))))(q)
     # Z_th is a Padé approximant of an exponential, whose derivative the slopes take instead.
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
     of = Calibrations.of(driver)

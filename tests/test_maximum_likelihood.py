@@ -13,14 +13,13 @@ import etid
 from etid.circuits.circuit import SkinRC
 from etid.estimators import registry
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood import load, search
-from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.maximum_likelihood.profile import Records
+from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
 from etid.identify.options import Options, plan
+from etid.likelihood import search
+from etid.likelihood.profile import Records
 from etid.recordings.preflight import Inspected
-from etid.signals.harmonics import Spectrum
 from etid.simulation.scenes import Scene, Trial, paper_calibration
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from etid.solvers.matrices import inverse_root
@@ -133,14 +132,13 @@ def test_a_fit_passes_through_few_files(study, driver):
     ],
 )
 def test_the_likeliest_start_is_taken_unless_it_is_bad(monkeypatch, starts, best):
-    monkeypatch.setattr(load.Load, "__call__", lambda _, q: q)  # Σ r² is q²
-    of = object.__new__(load.Load)
-    line = jnp.ones(8)
-    wave = line.astype(complex)
-    records = Records.of(Spectrum(line, wave, wave, line, line, jnp.arange(8) < 5))
-    for name, value in {"gains": None, "records": records, "unloaded": None}.items():
-        object.__setattr__(of, name, value)
-    assert float(search._best(of, jnp.array(starts)[:, None])[0]) == best
+    monkeypatch.setattr(search.Load, "objective", lambda _, q: 0.5 * (q**2).sum(-1))  # Σ r² is q²
+    line = np.ones(8)
+    used = (np.arange(8) < 5)[None]
+    records = Records(line, line + 0j, line, line[None] + 0j, line[None], used)
+    of = object.__new__(search.Load)
+    object.__setattr__(of, "records", records)
+    assert search._best(of, np.array(starts)[::-1, None]) == best  # the likeliest is the first
 
 
 @pytest.mark.slow
@@ -188,18 +186,16 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
 
 def test_the_search_at_the_knots_ends_at_the_minimum_of_all_harmonics(study, driver):
     lane = Harmonics.of(Inspected(study["loaded/0"]))
-    known = jax.device_put(known_of(lane, driver, True, MAXIMUM_LIKELIHOOD))
-    own = jnp.log(jnp.array([30e3, 150e3, 0.2e-9])), jnp.array([0.3])
-    start = jnp.concatenate([*own, known.mean])
+    known = known_of(lane, driver, True, MAXIMUM_LIKELIHOOD)
+    of = loads_of([lane], source_of(known), SkinRC(), None, calibrated(known))
+    start = np.concatenate([np.log([30e3, 150e3, 0.2e-9]), [0.3], known.mean])
+    q = jnp.asarray(search.minimum(of, start[None, None]).q[0])
 
-    @jax.jit
-    def distance(start, lane):
-        of = Load.behind(known, SkinRC(), Records.of(lane.spectrum), lane.sample_rate)
-        q, _ = search.minimum(of, start)
-        jacobian = jax.jacfwd(of)(q)
-        return of(q) @ jacobian @ inverse_root(jacobian.T @ jacobian)
+    def objective(q):
+        return of.objective(q[None])[0]
 
-    left = distance(start, jax.tree.map(jnp.asarray, lane))
+    slope, curvature = jax.jit(lambda q: (jax.grad(objective)(q), jax.hessian(objective)(q)))(q)
+    left = slope @ inverse_root(curvature)
     # Lines between knots are wrong by a thousandth, and the residual has a standard deviation.
     assert float(jnp.linalg.norm(left)) < 0.03
 

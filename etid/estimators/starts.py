@@ -6,11 +6,9 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.estimators.harmonic_start import start_of_skin
-from etid.estimators.unknowns import LoadUnknowns
 from etid.precision import array_function, namespace
 from etid.results.driver import SourceImpedance
-from etid.signals.harmonics import Spectrum, signal_share
+from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, frequency_variable, poles, power
 
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels of the starts of a circuit
@@ -20,7 +18,6 @@ GENERIC = (((0.1, 0.3), (0.5, 1.5)), ((0.25, 0.3), (0.5, 1.5)), ((0.1, 0.3), (0.
 FAR = (0.5, 1.5)
 # Time constants of the starts with a measured current, relative to the typical ones.
 TIME_SCALES = tuple(np.geomspace(1e-3, 1e5, 17).tolist())
-START_STEPS = 5  # iterations of Steiglitz-McBride on harmonics; more of them spare a fit no steps
 
 
 def circuit_starts(
@@ -78,18 +75,6 @@ def current_starts(
         return logs + jnp.sum(weight * off) / jnp.sum(weight) * by_size
 
     return jax.vmap(start)(jnp.asarray(TIME_SCALES))
-
-
-def harmonic_starts(
-    spectrum: Spectrum,
-    sample_rate: Float[Array, ""],
-    z_th: Complex[Array, " harmonic"],
-    circuit: AbstractCircuit,
-) -> LoadUnknowns:
-    """Starts of a fit on harmonics, stacked; the likeliest is the last."""
-    skin, delay = start_of_skin(spectrum, z_th, sample_rate, START_STEPS)
-    starts = circuit_starts(circuit, skin)
-    return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(delay))
 
 
 @array_function

@@ -21,11 +21,14 @@ from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
 from etid.estimators.judgement import STRAINED, misses
 from etid.estimators.lanes import AbstractLane, Harmonics, Lags, replaced, stacked, taken, unstacked
-from etid.estimators.maximum_likelihood.estimator import description
+from etid.estimators.maximum_likelihood.estimator import (
+    NO_OTHER_CIRCUIT,
+    NO_OTHER_GAIN,
+    description,
+)
 from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
 from etid.estimators.maximum_likelihood.verdict import judged
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
-from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.identify.arguments import check_new, require
 from etid.identify.fitting import (
     Batch,

@@ -208,7 +208,7 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
         relevant,
         xp.where(possible, spreads.stderr, 0.0),
         xp.where(possible[..., None], spreads.slope, 0.0),
-        _would_show(layer, np.asarray(gains.circuit.scaling()[0])),
+        would_show(layer, np.asarray(gains.circuit.scaling()[0])),
     )
     other, contradicts = scores.verdicts(seen)
     width = load.width[e]  # of the prior of the delay of V_out
@@ -250,7 +250,7 @@ def _block(own: Float[AnyArray, " own"], of_source: Float[AnyArray, "z z"]) -> A
     return xp.concatenate([upper, lower], 0)
 
 
-def _would_show(layer: Scores, powers: np.ndarray) -> Float[AnyArray, "*row"]:
+def would_show(layer: Scores, powers: np.ndarray) -> Float[AnyArray, "*row"]:
     """Standard deviations of a layer, if no element would be negative then.
 
     Z is linear in R and in 1/C, whose logarithms are those of the elements times `powers`. Infinite

@@ -33,6 +33,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC, impedance_at
+from etid.likelihood.gains import VoltageAndCurrent
 from etid.likelihood.linear import in_turn
 from etid.likelihood.search import Load
 from etid.precision import array_function, held, namespace
@@ -52,7 +53,7 @@ def starts(load: Load) -> Float[AnyArray, "start *row q"]:
     """Starts of a search, the likeliest first; the others serve where it is far away."""
     if load.gains.source.loaded is None:
         own = _by_current(load, load.records.x, load.records.variance_x)
-    elif load.gains.outputs.count == 2:
+    elif isinstance(load.gains.outputs, VoltageAndCurrent):
         records = load.records
         own = _by_current(load, records.y[..., 1, :], records.variance_y[..., 1, :])
     else:

@@ -7,20 +7,30 @@ only by an amplitude a and a delay τ,
 
     X_k = a e^(−jω_k τ) X⁰_k (1 + δ_k),      δ = 0.
 
-If a part has changed, δ is smooth in frequency. Another pulse, for example a longer one, has other
+If a part has changed, δ is smooth in frequency; here `DEGREE` complex polynomials of log f. Another
+pulse, for example a longer one, has other
 zeros, and its δ is not smooth. It tells nothing about the driver and is no fault.
 """
 
-from typing import Any
+from typing import NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Complex, Float
 
 from etid.likelihood.noise import excess
 from etid.likelihood.profile import Records
 from etid.precision import array_function, namespace
+from etid.results.driver import HarmonicDriver
+from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import AnyArray, as_complex, power, turns
 
+DEGREE = 6  # polynomials of δ; its real part has no constant, because that is the amplitude
+FIRST = 6  # first harmonics, which are not used because of hum and drift
+SIGNAL = 0.9  # smallest share of signal in the power around a harmonic that is used
+# Difference that the drift of a driver makes, relative to the drift. It is three times the standard
+# deviation by an inductance, which has the largest effect.
+DRIFT = 0.2
 SEEN = 37.37  # χ² that all directions exceed by chance once in 10 000
 SIZE = 1.5e-4  # smallest difference relative to V_th; pulses repeat no better than this
 OTHER = 0.1  # difference relative to V_th of another pulse; doubling a part has less effect
@@ -30,11 +40,66 @@ SMOOTH = 1 / 3  # part of the difference that must be smooth
 SAME_FREQUENCY = 1e-6
 
 
+class UnloadedShape(NamedTuple):
+    """The unloaded voltage of a calibration.
+
+    Attributes:
+        frequency: Harmonics [Hz].
+        x: Fourier coefficients [V]; 0 where they are not used.
+        variance: E|noise|² of each coefficient [V²].
+        directions: Orthonormal directions in which δ changes `x`, orthogonal to amplitude and
+            delay; first the real parts, then the imaginary parts.
+        bias: Bias along each direction [V]. It arises because the directions contain the noise of
+            `x` too.
+        drift: Difference that the drift of the driver makes, relative to V_th.
+    """
+
+    frequency: Float[AnyArray, " harmonic"]
+    x: Complex[AnyArray, " harmonic"]
+    variance: Float[AnyArray, " harmonic"]
+    directions: Float[AnyArray, "direction part"]
+    bias: Float[AnyArray, " direction"]
+    drift: Float[AnyArray, ""]
+
+
 @array_function
-def differs(shape: Any, records: Records) -> Bool[AnyArray, "*row"]:
+def shape(spectrum: Spectrum, drift: Float[AnyArray, ""] | None = None) -> UnloadedShape:
+    """The unloaded voltage of a calibration whose driver has this drift."""
+    xp, f, size = namespace(spectrum.x), spectrum.frequency, spectrum.x.shape[0]
+    clear = signal_share(spectrum.x, spectrum.variance_x) > SIGNAL
+    used = spectrum.selected & clear & (np.arange(size) >= FIRST)
+    x = xp.where(used, spectrum.x, 0)
+    u = 2 * xp.log(f / f[0]) / xp.log(f[-1] / f[0]) - 1
+    smooth = xp.stack([xp.cos(n * xp.arccos(xp.clip(u, -1, 1))) for n in range(DEGREE)])
+    by_delta = smooth * x
+    by_delay = 1j * x * f / f[-1]
+    rows = xp.concatenate([x[None], by_delay[None], by_delta[1:], by_delta * 1j])
+    real = xp.concatenate([rows.real, rows.imag], axis=1)
+    directions = xp.linalg.qr(real.T)[0].T[2:]
+    # Σ Re (q/x)* σ²: a direction q is x times a function of frequency; the difference contains −x.
+    share = xp.where(used, spectrum.variance_x / xp.where(used, power(x), 1.0), 0.0)
+    bias = directions @ (xp.concatenate([x.real, x.imag]) * xp.tile(share, 2))
+    made = xp.asarray(DRIFT * (0.0 if drift is None else drift))
+    return UnloadedShape(f, x, spectrum.variance_x, directions, bias, made)
+
+
+def shape_of(
+    driver: HarmonicDriver, frequency: Float[AnyArray, " harmonic"]
+) -> UnloadedShape | None:
+    """The unloaded voltage of the first calibration of a driver, for loads of these harmonics [Hz].
+
+    None if the driver has another number of harmonics than the loads.
+    """
+    if driver.spectra.x.shape[1:] != frequency.shape:
+        return None
+    return shape(jax.tree.map(lambda leaf: leaf[0], driver.spectra), driver.drift)
+
+
+@array_function
+def differs(shape: UnloadedShape, records: Records) -> Bool[AnyArray, "*row"]:
     """Whether the unloaded voltages of recordings show that the driver has changed.
 
-    `shape` is the unloaded voltage of a calibration, an `UnloadedShape`.
+    `shape` is the unloaded voltage of a calibration.
     """
     xp = namespace(records.x)
     known = xp.where(records.used[..., 0, :], shape.x, 0)

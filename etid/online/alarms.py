@@ -68,7 +68,7 @@ import scipy
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.directions import DIRECTIONS
-from etid.estimators.score_tests.other_circuit import NOTHING, Score
+from etid.likelihood.scores import NOTHING, Scores
 from etid.online.pulse_fit import Expected, Pulse
 from etid.solvers.matrices import inverse_of_few
 
@@ -230,8 +230,8 @@ def estimate(
     return score / known, jnp.sqrt(information + common**2) / known
 
 
-def score_of(sums: Float[Array, " 3"], slope: Float[Array, " element"]) -> Score:
+def score_of(sums: Float[Array, " 3"], slope: Float[Array, " element"]) -> Scores:
     """The score of a change from its sums s, I and c, and the slopes of the elements."""
     size, stderr = estimate(sums)
-    moved = jnp.abs(size) * jnp.max(jnp.abs(slope))
-    return Score(size / stderr, size, moved, stderr, slope, slope)
+    moved, z = jnp.abs(size) * jnp.max(jnp.abs(slope)), size / stderr
+    return Scores(z, size, moved, stderr, slope, slope, z**2)

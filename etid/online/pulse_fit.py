@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.circuit import AbstractCircuit, with_slopes
 from etid.circuits.directions import At, spread
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.rows import source_of
 from etid.estimators.unknowns import LoadUnknowns
 from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.online.gain_bands import Bands
@@ -93,11 +94,11 @@ class GainModel(Module):
         noise_freedom: int,
     ) -> "GainModel":
         """The model of loads behind the driver `known`, with the phases of all `DELAYS`."""
-        source = known.z_th(combined(known.mean, known.slope))
+        loaded = source_of(known).z_loaded(combined(known.mean, known.slope))
+        source = loaded - as_complex(known.resistance)
         turn = 2 * jnp.pi * bands.frequency / bands.sample_rate
         turns = _unit(jnp.asarray(DELAYS)[:, None] * turn[None, :])
         freedom = jnp.asarray(float(noise_freedom))
-        loaded = source + as_complex(known.resistance)
         by_source = known.slope * (loaded * reciprocal(source))[None, :]
         independent = root(known.cov).T
         error = combined(independent, by_source)

@@ -14,6 +14,7 @@ from etid.estimators.estimator import Description
 from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
 from etid.estimators.registry import register_description
 from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.scores import doubt
 from etid.online.alarms import MOVED, SEEN_IN_PULSES, SPREAD, score_of
 from etid.online.noise import Noise, directions
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
@@ -186,8 +187,8 @@ def fit_of(
     # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
     of_x = pulse.by_x(expected.gain)
     slope = -by_term @ pulse.whitened(expected.gain)
-    likely, doubt = score_of(state.scores[0], slope).doubt()
-    shared = of_source @ of_source.T + (by_term * of_x[None, :]) @ by_term.T + doubt
+    likely, of_doubt = doubt(score_of(state.scores[0], slope), jnp.zeros((), bool))
+    shared = of_source @ of_source.T + (by_term * of_x[None, :]) @ by_term.T + of_doubt
     cov = inverse(state.information) + shared
     relative = jnp.sqrt(jnp.diagonal(cov))
     fitted = model.circuit.with_log_values(logs)

@@ -2,7 +2,7 @@
 
 With much noise a Cole element passes for a capacitor, and R_s is then wrong by more than its
 standard error. The score of a fit tells, without another fit, the estimate ε̂ ± σ of α − 1, and how
-the elements would move with it (`etid.estimators.score_tests.other_circuit`). Let −ε have a
+the elements would move with it (`etid.likelihood.scores`). Let −ε have a
 half-normal prior of width τ. Then ε is normal below 0 with
 
     v = 1 / (1/σ² + 1/τ²),   m = v ε̂ / σ²,

@@ -11,7 +11,7 @@ can be subtracted from the samples.
 
 **Hum on a harmonic**, such as 60 Hz with pulses of 60 Hz, can be distinguished from the pulses only
 by a model. `lines` marks the harmonics on which hum may fall.
-`etid.estimators.maximum_likelihood.profile` detects it there in the residual of a fit.
+`etid.likelihood.noise` detects it there in the residual of a fit.
 """
 
 import functools

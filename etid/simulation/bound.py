@@ -8,7 +8,7 @@ slow, it is the same in each period. X and Z_th are unknown complex numbers at e
 the bound holds for every kind of driver.
 Without a calibration V_th tells nothing about the load, and the bound is that of the input I and
 the output Z_L e^(−jωτ) I. The information about the gains is (Pintelon and Schoukens, System
-Identification, 2012, ch. 9 and 16; `etid.estimators.maximum_likelihood.profile`)
+Identification, 2012, ch. 9 and 16; `etid.likelihood.profile`)
 
     P = 2 |X|² (diag(w) − (w G)(w G)ᴴ / τ),      τ = w_x + Σ w |G|²,      w = 1/σ²,
 

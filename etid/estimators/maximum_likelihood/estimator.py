@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.directions import DIRECTIONS
 from etid.estimators.element_limits import Limits, stated_limits
 from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import (
@@ -25,8 +26,6 @@ from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import fit_one, fit_rows
 from etid.estimators.refined_driver import from_harmonics
-from etid.estimators.score_tests.falling_resistance import NO_FALL
-from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.likelihood.of_calibrations import MISSING_POLE
 from etid.precision import is_traced
 from etid.results.driver import Driver, HarmonicDriver
@@ -34,6 +33,20 @@ from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
 from etid.signals.transfer import AnyArray
+
+NO_OTHER_CIRCUIT = (
+    "score tests find no relaxation of the load that is spread over time constants (at most "
+    f"{DIRECTIONS['spread'].limit:.2g} standard deviations) and no further relaxation (at most "
+    f"{DIRECTIONS['relaxation'].limit:.2g})"
+)
+NO_OTHER_GAIN = (
+    "a score test finds no difference between the gains of the two records (at most "
+    f"{DIRECTIONS['gain'].limit:.2g} standard deviations)"
+)
+NO_FALL = (
+    "a score test finds no resistance of the load that falls with its current (at most "
+    f"{DIRECTIONS['falling'].limit:.2g} standard deviations)"
+)
 
 
 def description(

@@ -21,7 +21,7 @@ does not determine.
 
 **Errors of the instrument** θ with a tolerance are further common parameters. Several known
 resistors tell of them, too. A gain g, a crosstalk κ and a capacitance C change the outputs of a
-load (`etid.estimators.maximum_likelihood.gains`); all but C also change the calibrations. An error
+load (`etid.likelihood.gains`); all but C also change the calibrations. An error
 that nobody stated stays 0 in the fit. If it is not 0, the minimum of the calibrations moves,
 
     ∂z₀/∂θ = −Lᵀ H_cθ,
@@ -36,45 +36,21 @@ each pF. The data fix the gain of the calibration. With Q = 1 + Z_th/R, u = s R 
 """
 
 import dataclasses
-from typing import NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
-from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.maximum_likelihood.profile import Profile, Records
-from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
-from etid.estimators.starts import current_starts, harmonic_starts
-from etid.estimators.unknowns import LoadUnknowns
 from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.source_prior import DELAY_WIDTH
+from etid.likelihood.unloaded import UnloadedShape, shape_of
 from etid.precision import Module, array_function, namespace
 from etid.results.driver import HarmonicDriver
 from etid.results.instrument import BUDGETED, Instrument
-from etid.signals.harmonics import Spectrum, same_unloaded
-from etid.signals.knots import Knots
+from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import AnyArray, as_complex, combined, frequency_variable, reciprocal
 from etid.solvers.matrices import inverse_root
-
-
-class UnloadedEstimate(NamedTuple):
-    """The X of a load that the calibrations estimate, as a function of z.
-
-    Attributes:
-        x: X at z = 0.
-        variance: Its variance there.
-        x_by_z: Derivatives of X.
-        log_variance_by_z: Derivatives of the logarithm of the variance.
-    """
-
-    x: Complex[AnyArray, " harmonic"]
-    variance: Float[AnyArray, " harmonic"]
-    x_by_z: Complex[AnyArray, "z harmonic"]
-    log_variance_by_z: Float[AnyArray, "z harmonic"]
 
 
 class InstrumentErrors(Module):
@@ -97,10 +73,6 @@ class InstrumentErrors(Module):
     direct: Float[AnyArray, "3"]
     drift: Float[AnyArray, "z parameter"]
     told: Instrument | None
-
-    def values(self, z: Float[Array, " z"]) -> Float[Array, " error"]:
-        """The errors [their standard deviations]."""
-        return self.at + z @ self.by_z
 
 
 class GivenDriver(Module):
@@ -164,88 +136,6 @@ class GivenDriver(Module):
             gain_slopes=None,
             by_current=True,
         )
-
-    def w(
-        self, z: Float[AnyArray, " z"]
-    ) -> tuple[Complex[AnyArray, " harmonic"], Complex[AnyArray, "z harmonic"]]:
-        """W − W₀ by z, and its derivatives."""
-        w, slope = combined(z, self.slope), self.slope
-        if self.bend is None or self.errors is None:
-            return w, slope
-        theta, by_z = self.errors.values(z)[-1], self.errors.by_z[:, -1]
-        w = w + as_complex(0.5 * theta**2) * self.bend
-        return w, slope + as_complex(theta * by_z)[:, None] * self.bend[None]
-
-    def z_th(self, w: Complex[AnyArray, " harmonic"]) -> Complex[AnyArray, " harmonic"]:
-        """Z_th [Ω] at W₀ + w."""
-        # (2, 2) Padé approximant of the exponential: error w⁵/720, a tenth of the time.
-        square = 1 + w * w / 12
-        half = 0.5 * w
-        return self.loaded * (square + half) * reciprocal(square - half) - as_complex(
-            self.resistance
-        )
-
-    def current(
-        self, total: Complex[AnyArray, " harmonic"], w: Complex[AnyArray, " harmonic"]
-    ) -> Complex[AnyArray, " harmonic"]:
-        """Current per input through this impedance [Ω] at W₀ + w."""
-        if self.by_current:
-            return namespace(total).ones_like(total)
-        return reciprocal(total + self.z_th(w))
-
-    def starts(
-        self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
-    ) -> LoadUnknowns:
-        """Starts of the fit of a recording, stacked; the likeliest is the last.
-
-        They have several impedance levels and a simpler estimate, or, behind a current, the
-        impedance level of the records and several time scales.
-        """
-        if self.by_current:
-            x, y = (jnp.where(spectrum.selected, one, 0) for one in (spectrum.x, spectrum.y))
-            variances = spectrum.variance_x, spectrum.variance_y
-            starts = current_starts(spectrum.frequency, (x, y), variances, circuit)
-            return LoadUnknowns(starts, jnp.zeros(starts.shape[0]))
-        z_th = self.z_th(jnp.zeros_like(self.loaded))
-        return harmonic_starts(spectrum, sample_rate, z_th, circuit)
-
-    def at_knots(self, knots: Knots) -> "GivenDriver":
-        """The same at the knots of the harmonics, without an estimate of X."""
-        return dataclasses.replace(
-            self,
-            frequency=knots.at(self.frequency),
-            loaded=knots.at(self.loaded),
-            w_slope=knots.at(self.w_slope),
-            slope=knots.at(self.slope),
-            bend=None if self.bend is None else knots.at(self.bend),
-            records=None,
-            gains=None,
-            gain_slopes=None,
-            shape=None,
-        )
-
-    def unloaded(self, records: Records) -> UnloadedEstimate | None:
-        """The X of a recording that the calibrations estimate; None if they share none with it."""
-        x, of, gains, slopes = records.x, self.records, self.gains, self.gain_slopes
-        if of is None or gains is None or slopes is None or x.size != of.x.shape[-1]:
-            return None  # a record of another length is another unloaded record
-        same = jnp.stack([jnp.asarray(same_unloaded(x, one)) for one in of.x])
-        used = of.selected & same[:, None]
-        outputs = dataclasses.replace(records, y=of.y, variance_y=of.variance_y, selected=used)
-
-        def estimate(
-            gains: Complex[Array, "record harmonic"],
-        ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
-            profile = Profile.of(outputs, gains)
-            return profile.x, jnp.log(profile.variance_x)
-
-        def slope(
-            direction: Complex[Array, "record harmonic"],
-        ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
-            return jax.jvp(estimate, (gains,), (direction,))[1]
-
-        profile = Profile.of(outputs, gains)
-        return UnloadedEstimate(profile.x, profile.variance_x, *jax.vmap(slope)(slopes))
 
 
 @array_function

@@ -67,31 +67,37 @@ def load_of(
     shared: Calibrated | None,
 ) -> Load:
     """One recording, or several with equal rates along leading axes."""
-    xp, source_mean = namespace(lane.x), source.mean
-    each = lane.y, lane.variance_y, lane.selected
-    y, variance_y, used = (of[..., None, :] for of in each)
-    outputs = Voltage()
+    xp, outputs = namespace(lane.x), Voltage()
+    y, variance_y, used = (of[..., None, :] for of in (lane.y, lane.variance_y, lane.selected))
     if isinstance(lane, HarmonicsWithCurrent) and source.loaded is not None:
         outputs = VoltageAndCurrent()
         y = xp.stack([lane.y, lane.i], -2)
         variance_y = xp.stack([lane.variance_y, lane.variance_i], -2)
         used = xp.stack([lane.selected, lane.selected], -2)
     records = Records(lane.frequency, lane.x, lane.variance_x, y, variance_y, used)
-    rate = lane.sample_rate.reshape(-1)[0]
-    gains = Gains(source, circuit, lane.frequency, rate, outputs)
     unloaded = None
     if shared is not None and shared.x.shape[-1] == records.x.shape[-1]:
         same = same_unloaded(records.x[..., None, :], shared.x)
         unloaded = Unloaded.by(shared, records, same)
-    count = gains.elements
-    own = np.zeros(count), np.full(count, np.inf)
+    gains = Gains(source, circuit, lane.frequency, lane.sample_rate.reshape(-1)[0], outputs)
+    return load_with(gains, records, prior, unloaded)
+
+
+def load_with(
+    gains: Gains,
+    records: Records,
+    prior: ElementPrior | None = None,
+    unloaded: Unloaded | None = None,
+) -> Load:
+    """Recordings of any outputs, with the priors of elements, delays and source."""
+    source, count, delays = gains.source, gains.elements, gains.outputs.count
+    xp, own = namespace(source.mean, source.delay_width), (np.zeros(count), np.full(count, np.inf))
     if prior is not None:
         own = prior.centre, prior.width
-    others = np.full(outputs.count - 1, DELAY_WIDTH)
-    xp = namespace(source_mean, source.delay_width)
-    centre = xp.concatenate([own[0], np.zeros(outputs.count), source_mean])
-    delay = xp.reshape(source.delay_width, 1)
-    width = xp.concatenate([own[1], delay, others, np.ones(source_mean.size)])
+    # How little the delays of V_out scatter tells nothing about those of other outputs.
+    of_delays = xp.reshape(source.delay_width, 1), np.full(delays - 1, DELAY_WIDTH)
+    centre = xp.concatenate([own[0], np.zeros(delays), source.mean])
+    width = xp.concatenate([own[1], *of_delays, np.ones(source.mean.size)])
     return Load(gains, records, centre, width, unloaded)
 
 

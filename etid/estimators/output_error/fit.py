@@ -30,6 +30,7 @@ from etid.circuits.elements import resistor
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.output_error.information import curvature, further, slopes
+from etid.estimators.output_error.other_in_time import EXACT, Shown, bends, relaxed, score
 from etid.estimators.output_error.prediction import (
     IMPULSE,
     Change,
@@ -42,7 +43,6 @@ from etid.estimators.output_error.prediction import (
     scaled_residual,
     state_scale,
 )
-from etid.estimators.score_tests.other_in_time import EXACT, Shown, bends, relaxed, score
 from etid.estimators.unknowns import Nuisance
 from etid.likelihood.sandwich import Curvature
 from etid.likelihood.source_prior import DELAY_WIDTH, SourcePrior, delay_std

@@ -1,6 +1,6 @@
 """Score tests of a fit in time whether a load is another circuit than the fitted one.
 
-Like `etid.estimators.score_tests.other_circuit`, they test for one more relaxation,
+Like `etid.likelihood.scores`, they test for one more relaxation,
 ΔZ = ε |Z(j/τ)| / (1 + sτ). In time this is one more state of the load. The same simulation gives
 the slope of the predicted voltage with respect to ε.
 
@@ -23,7 +23,7 @@ load, to first order in 1/U, where U is a voltage or current.
 - The current amplifier compresses its peaks: it shows i (1 − |i|/U), and V_out lacks Z_L |i| i / U.
 - The voltage amplifier compresses its peaks: it shows v (1 − |v|/U).
 - A resistance falls with its current. Like on harmonics
-  (`etid.estimators.score_tests.falling_resistance`), it adds −|u| u / U to the voltage u of the
+  (`etid.likelihood.scores`), it adds −|u| u / U to the voltage u of the
   relaxations, filtered by them: they are the load without its series resistance.
 """
 
@@ -48,9 +48,8 @@ from etid.estimators.output_error.prediction import (
     predict,
     residual_variance,
 )
-from etid.estimators.score_tests.other_circuit import Fitted, Score, scores
 from etid.estimators.unknowns import Nuisance
-from etid.likelihood.sandwich import Linear
+from etid.likelihood.scores import Linear, Scores, smooth
 from etid.results.driver import SourceImpedance
 from etid.results.feed import CurrentSource
 from etid.signals.filtering import CUTOFF, StateSpace, hold, simulate
@@ -177,7 +176,7 @@ def score(
     rest: Float[Array, " q"],
     precision: Float[Array, " q"],
     elements: int,
-) -> Score:
+) -> Scores:
     """Score of each change.
 
     The elements are the first parameters, and the source, of which `source_cov` is the covariance,
@@ -234,11 +233,11 @@ def score(
     scaled = terms(rows)
     by_change, by_parameter = scaled[:count], scaled[count:]
     ones = jnp.ones(scaled.shape[1])
-    linear = Linear(by_parameter, ones, ones, jnp.diag(jnp.sqrt(known)))
+    priors = jnp.diag(known)
     # A parameter that the record does not determine, such as an initial state, has no effect.
-    covariance = inverse(linear.curvature().expected, drop=True)
-    fitted = Fitted(rest, jnp.diag(known), covariance, slice(elements))
-    return scores(by_change, linear, terms(residual), fitted)
+    covariance = inverse(by_parameter @ by_parameter.T + priors, drop=True)
+    linear = Linear(by_parameter, ones, ones, terms(residual), rest, priors, covariance)
+    return smooth(linear, by_change, elements)
 
 
 class Shown(NamedTuple):
@@ -255,7 +254,7 @@ class Shown(NamedTuple):
     @classmethod
     def behind_current(
         cls,
-        found: Score,
+        found: Scores,
         errors: Float[Array, " element"],
         chi2: Float[Array, ""],
         least: Float[Array, ""] | float,
