@@ -14,7 +14,7 @@ import numpy as np
 import optimistix as optx
 import scipy.optimize
 import scipy.signal
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 import etid
 from benchmarks.ladder import recorded
@@ -32,7 +32,7 @@ from etid.precision import array_function
 from etid.recordings.preflight import Inspected
 from etid.signals.filtering import lfilter
 from etid.signals.harmonics import real_parts
-from etid.signals.transfer import as_complex
+from etid.signals.transfer import AnyArray, as_complex
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.solvers.levenberg_marquardt import normal_equations
 
@@ -80,7 +80,7 @@ class Problem(NamedTuple):
 
 
 @array_function
-def terms(own: Float[Array, " own"], load: Load) -> Float[Array, " term"]:
+def terms(own: Float[AnyArray, " own"], load: Load) -> Float[AnyArray, " term"]:
     """What all solvers minimise the squares of."""
     of = Profile.of(load.records, load.gains(own))
     scaled = (of.innovations * as_complex(jnp.sqrt(of.weight))).ravel()

@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,7 +62,8 @@ def added(z, current, every):
     at = z[every.index]
     one = np.ones((1, at.size), complex)
     slopes = Slopes(at, at[None], one, one, one[None])
-    near = Near(np.zeros(1), np.zeros(()), SimpleNamespace(x=current), None, slopes, None)
+    known: Any = SimpleNamespace(x=current), None  # of the likelihood X is used only
+    near = Near(np.zeros(1), np.zeros(()), *known, slopes, None)
     return falling(near, every)
 
 
