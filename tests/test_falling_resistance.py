@@ -62,8 +62,9 @@ def added(z, current, every):
     at = z[every.index]
     one = np.ones((1, at.size), complex)
     slopes = Slopes(at, at[None], one, one, one[None])
-    known: Any = SimpleNamespace(x=current), None  # of the likelihood X is used only
-    near = Near(np.zeros(1), np.zeros(()), *known, slopes, None)
+    profile: Any = SimpleNamespace(x=current)
+    nothing: Any = None
+    near = Near(np.zeros(1), np.zeros(()), profile, nothing, slopes, None)
     return falling(near, every)
 
 

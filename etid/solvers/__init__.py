@@ -1,4 +1,4 @@
-"""Least squares: Levenberg-Marquardt, successive approximations, and propagation of errors.
+"""Least squares: Levenberg-Marquardt, harmonic balance, and propagation of errors.
 
 Models do not belong here: the solvers see only residuals and normal equations.
 """
