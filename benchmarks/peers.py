@@ -32,7 +32,7 @@ from etid.precision import array_function
 from etid.recordings.preflight import Inspected
 from etid.signals.filtering import lfilter
 from etid.signals.harmonics import real_parts
-from etid.signals.transfer import AnyArray, as_complex
+from etid.signals.transfer import AnyArray
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.solvers.levenberg_marquardt import normal_equations
 
@@ -83,8 +83,8 @@ class Problem(NamedTuple):
 def terms(own: Float[AnyArray, " own"], load: Load) -> Float[AnyArray, " term"]:
     """What all solvers minimise the squares of."""
     of = Profile.of(load.records, load.gains(own))
-    scaled = (of.innovations * as_complex(jnp.sqrt(of.weight))).ravel()
-    return jnp.concatenate([real_parts(scaled), load.rest(own)])
+    scale = jnp.where(load.records.used, jnp.sqrt(2 / of.expected), 0.0)
+    return jnp.concatenate([real_parts((of.innovations * scale).ravel()), load.rest(own)])
 
 
 def harmonics(record: etid.Recording) -> Harmonics:
@@ -225,7 +225,12 @@ def _by_optimistix(of: Problem) -> Callable[[Any], Any]:
     """Elements and delay of one lane."""
     start, settings = jnp.asarray(START), {"max_steps": MAX_STEPS, "throw": False}
     stock = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-    return lambda one: optx.least_squares(terms, stock, start, args=of.load(one), **settings).value
+
+    def fit(one: Any) -> Float[AnyArray, " own"]:
+        load = of.load(one)
+        return optx.least_squares(lambda q, _: terms(q, load), stock, start, **settings).value
+
+    return fit
 
 
 def _minpack(value: Callable, slope: Any) -> np.ndarray:

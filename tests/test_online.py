@@ -11,12 +11,13 @@ import pytest
 import scipy.stats
 
 import etid
-from etid.estimators.maximum_likelihood import given_driver
+from etid.estimators.maximum_likelihood.rows import source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_at
 from etid.online import alarms, tick
 from etid.online.tracker import Tracker
 from etid.results.driver import ContinuousDriver
+from etid.signals.transfer import as_complex, combined
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, Sampler, SkinLoad, loading
 from tests.skins import off
@@ -202,7 +203,8 @@ def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
     step = 1e-3  # of a standard deviation of Z_th
 
     def logarithms(z):
-        source = known.z_th(given_driver.combined(known.mean + z, known.slope))
+        loaded = source_of(known).z_loaded(combined(known.mean + z, known.slope))
+        source = loaded - as_complex(known.resistance)
         other = dataclasses.replace(tracker.model, source=source)
         other = dataclasses.replace(tracker, model=other)
         return np.asarray(functools.reduce(other.update, pulses, anew(state)).electrodes.own)[
