@@ -7,6 +7,7 @@ itself for a paper. Your own estimator is a subclass; `etid.estimators.registry.
 import abc
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -123,6 +124,8 @@ class AbstractEstimator(abc.ABC):
         current: Whether the estimator identifies loads from a measured current, without a driver.
         any_circuit: Whether the estimator identifies circuits other than `SkinRC`.
         chooses: Whether its fits have a `support`, by which circuits can be compared.
+        rows: Whether NumPy runs `fit_driver` and `fit_rows` as they stand; if not, `fit_driver` and
+            `fit_load` are traced.
     """
 
     name: ClassVar[str]
@@ -131,6 +134,7 @@ class AbstractEstimator(abc.ABC):
     current: ClassVar[bool] = False
     any_circuit: ClassVar[bool] = True
     chooses: ClassVar[bool] = False
+    rows: ClassVar[bool] = False
 
     @abc.abstractmethod
     def fit_driver(
@@ -162,6 +166,22 @@ class AbstractEstimator(abc.ABC):
             known: The value that `known` returned for this driver.
             circuit: Structure of the load and its typical values.
         """
+
+    def fit_rows(
+        self, lanes: Sequence[AbstractLane], driver: Any, known: Any, circuit: AbstractCircuit
+    ) -> list[Fit]:
+        """Identify the loads of several recordings, for estimators with `rows`.
+
+        Args:
+            lanes: Data of the recordings.
+            driver: Their driver.
+            known: The value that `known` returned for this driver.
+            circuit: Structure of the loads and its typical values.
+
+        Returns:
+            The fits, stacked in parts.
+        """
+        raise NotImplementedError
 
     @abc.abstractmethod
     def describe(self) -> Description:

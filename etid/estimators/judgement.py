@@ -17,13 +17,13 @@ from etid.circuits.circuit import AbstractCircuit, too_steep
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
+from etid.likelihood.linear import NormalEquations
 from etid.precision import namespace
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Support
 from etid.results.instrument import Effects
 from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.signals.transfer import AnyArray
-from etid.solvers.levenberg_marquardt import NormalEquations
 from etid.solvers.matrices import inverse
 
 # Inherited from lineax; the type checker does not see them as members of our class.
@@ -173,6 +173,6 @@ def unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:
     return dataclasses.replace(fit, result=RESULTS.where(wrong, result, fit.result))
 
 
-def distance_to_minimum(equations: NormalEquations) -> Float[Array, ""]:
+def distance_to_minimum(equations: NormalEquations) -> Float[AnyArray, ""]:
     """Squared distance to the minimum [standard errors squared]."""
     return equations.gradient @ inverse(equations.matrix) @ equations.gradient

@@ -299,9 +299,8 @@ class AlignedSamples(AbstractLane):
         return cls(m.v_th, m.v_out, *known, jnp.asarray(m.v_out.shape[0]))
 
     def measure(self) -> Measurement:
-        """Both records and their noise, as arrays of JAX."""
-        fields = (self.v_th, self.v_out, self.sigma_th, self.sigma_out, self.sample_rate)
-        return Measurement(*map(jnp.asarray, fields))
+        """Both records and their noise."""
+        return Measurement(self.v_th, self.v_out, self.sigma_th, self.sigma_out, self.sample_rate)
 
 
 class PaddedSamples(AlignedSamples):

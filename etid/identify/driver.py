@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from etid.circuits.display import rounded
 from etid.estimators.estimator import AbstractEstimator, serving
 from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
-from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.registry import Method
 from etid.identify import changes
 from etid.identify.arguments import check_alike, check_distinct, recordings
@@ -275,8 +274,9 @@ def _identified(
     estimator: AbstractEstimator,
     instrument: Instrument | None,
 ) -> Driver:
-    if isinstance(estimator, MaximumLikelihood) and isinstance(lanes, Harmonics):
-        return jax.device_put(estimator.fit_driver(lanes, r_load, order, instrument))
+    if estimator.rows:
+        records = lanes.measure() if isinstance(lanes, AlignedSamples) else lanes
+        return jax.device_put(estimator.fit_driver(records, r_load, order, instrument))
     return _traced(lanes, r_load, order, estimator, instrument)
 
 

@@ -455,8 +455,7 @@ def fits_of(
 ) -> Fit:
     """Fits of lanes of one shape, stacked; `total` is their number here and in other calls."""
     of = driver, known, circuit, estimator
-    rows = ROWS and jax.default_backend() == "cpu"
-    if rows and isinstance(estimator, MaximumLikelihood):
+    if ROWS and jax.default_backend() == "cpu" and estimator.rows:
         parts = estimator.fit_rows(lanes, *of[:-1])
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     if not worth_compiling(total, lanes[0].periodic):

@@ -27,15 +27,17 @@ from etid.results.verdicts import RESULTS, Judged, counted, message
 from etid.signals.transfer import AnyArray, power
 
 
-def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
+def rrse(
+    predicted: Float[AnyArray, "*row time"], measured: Float[AnyArray, "*row time"]
+) -> Float[AnyArray, "*row"]:
     """Root relative squared error, sqrt(Σ (V − W)² / Σ (W − mean W)²)   (paper, eq. 3).
 
     The RRSE does not show errors of the circuit: 2.73 % is as common with a correct C_p as with a
     C_p that is wrong by 85 %. Judge a fit by χ² and the standard errors.
     """
-    return jnp.sqrt(
-        jnp.sum((predicted - measured) ** 2) / jnp.sum((measured - jnp.mean(measured)) ** 2)
-    )
+    off = measured - measured.mean(-1, keepdims=True)
+    missed = ((predicted - measured) ** 2).sum(-1)
+    return namespace(missed).sqrt(missed / (off**2).sum(-1))
 
 
 def complex_rrse(

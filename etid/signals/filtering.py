@@ -33,9 +33,11 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
 
-from etid.precision import Module
+from etid.precision import Module, namespace
+from etid.signals.transfer import AnyArray
 
 BLOCK = 32  # samples; a larger block costs more in the Toeplitz product and less in the scan
 TAPS = 24  # samples of the interpolation kernel on each side of an interval
@@ -162,6 +164,16 @@ def lfilter(
     system = companion(b, a)
     zi = jnp.zeros(system.C.shape[0], x.dtype) if zi is None else zi
     return simulate(system, x[:, None], zi)
+
+
+def from_rest(
+    b: Float[AnyArray, " b"], a: Float[AnyArray, " a"], x: Float[AnyArray, "*record time"]
+) -> Float[AnyArray, "*record time"]:
+    """`lfilter` from a state of 0, of several records at once."""
+    if namespace(a, b, x) is np:
+        return scipy.signal.lfilter(b, a, x)
+    each = jax.vmap(lambda one: lfilter(b, a, one)[0])(x.reshape(-1, x.shape[-1]))
+    return each.reshape(x.shape)
 
 
 @functools.cache

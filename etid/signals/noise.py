@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from etid.precision import Module
 from etid.signals.harmonics import namespace
 from etid.signals.quiet_parts import are_loud, changes, window_of
+from etid.signals.transfer import AnyArray
 from etid.signals.white_noise import noise_std, quietest
 
 RIPPLE = 1e-5  # error of the interpolation relative to the signal: a lower limit of the noise
@@ -275,11 +276,11 @@ class Measurement(Module):
         sample_rate: Sampling rate [Hz].
     """
 
-    v_th: Float[Array, "*lane time"]
-    v_out: Float[Array, "*lane time"]
-    sigma_th: Float[Array, "*lane"]
-    sigma_out: Float[Array, "*lane"]
-    sample_rate: Float[Array | np.ndarray, "*lane"]
+    v_th: Float[AnyArray, "*lane time"]
+    v_out: Float[AnyArray, "*lane time"]
+    sigma_th: Float[AnyArray, "*lane"]
+    sigma_out: Float[AnyArray, "*lane"]
+    sample_rate: Float[AnyArray, "*lane"]
 
 
 def floor(

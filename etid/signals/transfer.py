@@ -9,7 +9,9 @@ The functions of numbers at frequencies compute in the namespace of their arrays
 give arrays of NumPy, and nothing is traced.
 """
 
+import functools
 import math
+import operator
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -24,13 +26,11 @@ AnyArray = Any  # of NumPy or JAX; a result has the namespace of the arguments
 Values = TypeVar("Values", Array, np.ndarray)
 
 
-def multiply_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[Array, " pq"]:
+def multiply_polynomials(p: Float[AnyArray, " p"], q: Float[AnyArray, " q"]) -> AnyArray:
     """Multiply two polynomials given by ascending coefficients."""
-    length = p.shape[0] + q.shape[0] - 1
-    return sum(
-        (jnp.pad(p[i] * q, (i, length - i - q.shape[0])) for i in range(p.shape[0])),
-        start=jnp.zeros(length, jnp.result_type(p, q)),
-    )
+    xp, length = namespace(p, q), p.shape[0] + q.shape[0] - 1
+    parts = [xp.pad(p[i] * q, (i, length - i - q.shape[0])) for i in range(p.shape[0])]
+    return functools.reduce(operator.add, parts)
 
 
 def add_polynomials(p: Float[AnyArray, " p"], q: Float[AnyArray, " q"]) -> Float[AnyArray, " pq"]:
@@ -207,13 +207,13 @@ def is_stable(a: Float[AnyArray, " order1"]) -> Bool[AnyArray, ""]:
     return stable
 
 
-def reflect_poles(a: Float[Array, " order1"]) -> Float[Array, " order1"]:
+def reflect_poles(a: Float[AnyArray, " order1"]) -> Float[AnyArray, " order1"]:
     """Reflect poles outside the unit circle into it; the shape of |A(e^{jω})| stays the same."""
-    roots = poles(a)
-    outside = jnp.abs(roots) > 1
-    inside = jnp.where(outside, 1 / jnp.conj(jnp.where(outside, roots, 2.0)), roots)
-    coefficients = jnp.ones(1, inside.dtype)
+    xp, roots = namespace(a), poles(a)
+    outside = xp.abs(roots) > 1
+    inside = xp.where(outside, 1 / xp.conj(xp.where(outside, roots, 2.0)), roots)
+    coefficients = xp.ones(1, inside.dtype)
     for i in range(inside.shape[0]):
-        shifted = jnp.pad(coefficients, (1, 0)) * -inside[i]
-        coefficients = jnp.pad(coefficients, (0, 1)) + shifted
-    return jax.lax.stop_gradient(coefficients.real)
+        shifted = xp.pad(coefficients, (1, 0)) * -inside[i]
+        coefficients = xp.pad(coefficients, (0, 1)) + shifted
+    return coefficients.real if xp is np else jax.lax.stop_gradient(coefficients.real)

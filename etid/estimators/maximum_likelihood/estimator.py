@@ -116,6 +116,7 @@ class MaximumLikelihood(AbstractEstimator):
     driver = HarmonicDriver
     current = True
     chooses = True
+    rows = True
 
     def __post_init__(self) -> None:
         if self.with_current:

@@ -28,12 +28,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from etid.circuits.circuit import SkinRC
-from etid.precision import namespace
+from etid.precision import array_function, namespace
 from etid.results.fit import complex_rrse, rrse
-from etid.signals.filtering import lfilter
+from etid.signals.filtering import from_rest
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import (
     AnyArray,
@@ -70,10 +70,10 @@ class Iterate(eqx.Module):
     stable: Bool[AnyArray, ""]
 
 
-def _delayed(v: Float[Array, "record time"], lags: range) -> Float[Array, "record time lag"]:
-    """Copies of the records, delayed by each lag."""
-    time = v.shape[-1]
-    return jnp.stack([jnp.pad(v, ((0, 0), (k, 0)))[:, :time] for k in lags], axis=-1)
+def delayed(v: Float[AnyArray, "record time"], lags: range) -> list[AnyArray]:
+    """Copies of the records (record time), delayed by each lag."""
+    xp, time = namespace(v), v.shape[-1]
+    return [xp.pad(v, ((0, 0), (k, 0)))[:, :time] for k in lags]
 
 
 def check_iterations(iterations: int) -> None:
@@ -156,35 +156,68 @@ def no_poles(xp: ModuleType, order: int) -> Float[AnyArray, " order1"]:
 
 
 def in_time(
-    x: Float[Array, "record time"], w: Float[Array, "record time"], zeros: int, poles: int
-) -> Callable[[Float[Array, " a"]], Rational]:
+    x: Float[AnyArray, "record time"], w: Float[AnyArray, "record time"], zeros: int, poles: int
+) -> Callable[[Float[AnyArray, " a"]], Rational]:
     """The step of the iteration for records X and W."""
-    one = jnp.ones(1, x.dtype)
+    xp = namespace(x)
+    one = xp.ones(1, x.dtype)
 
-    def solve(previous: Float[Array, " a"]) -> Rational:
+    def solve(previous: Float[AnyArray, " a"]) -> Rational:
         # A prefilter must be stable. Reflected poles give the same magnitude response.
-        prefilter = jnp.where(is_stable(previous), previous, reflect_poles(previous))
-        both = jnp.concatenate([x, w])  # filtered at once, which takes less time
-        xf, wf = jnp.split(jax.vmap(lambda v: lfilter(one, prefilter, v)[0])(both), 2)
-        delayed = [_delayed(xf, range(zeros + 1)), -_delayed(wf, range(1, poles + 1))]
-        columns = jnp.concatenate([*delayed, wf[..., None]], axis=-1)
-        return least_squares(columns.reshape(-1, zeros + poles + 2), poles)
+        prefilter = xp.where(is_stable(previous), previous, reflect_poles(previous))
+        xf, wf = xp.split(from_rest(one, prefilter, xp.concatenate([x, w])), 2)
+        columns = [*delayed(xf, range(zeros + 1)), *delayed(-wf, range(1, poles + 1)), wf]
+        return least_squares(xp.stack(columns).reshape(len(columns), -1).T, poles)
 
     return solve
 
 
 def terminal_voltage(
-    z_th: Rational, z_load: Rational, v_th: Float[Array, " time"]
-) -> tuple[Float[Array, " time"], Bool[Array, ""]]:
+    z_th: Rational, z_load: Rational, v_th: Float[AnyArray, " time"]
+) -> tuple[Float[AnyArray, " time"], Bool[AnyArray, ""]]:
     """Predicted V_out = V_th · Z_L / (Z_L + Z_th), and whether the closed loop is stable.
 
     The closed loop is N_L D_th / (N_L D_th + N_th D_L). It can be unstable even if Z_th is stable.
     """
+    forward, closed, stable = _closed_loop(z_th, z_load)
+    return from_rest(forward, closed, v_th), stable
+
+
+def _closed_loop(
+    z_th: Rational, z_load: Rational
+) -> tuple[Float[AnyArray, " f"], Float[AnyArray, " c"], Bool[AnyArray, ""]]:
+    """Numerator and denominator of V_out/V_th, which is 1 if not stable; and whether it is."""
     forward = multiply_polynomials(z_load.num, z_th.den)
-    denominator = add_polynomials(forward, multiply_polynomials(z_th.num, z_load.den))
-    stable = is_stable(denominator)
-    safe = jnp.where(stable, denominator, jnp.zeros_like(denominator).at[0].set(1.0))
-    return lfilter(forward, safe, v_th)[0], stable
+    closed = add_polynomials(forward, multiply_polynomials(z_th.num, z_load.den))
+    stable = is_stable(closed)
+    one = np.arange(closed.shape[0]) == 0
+    return forward, namespace(closed).where(stable, closed, 1.0 * one), stable
+
+
+def with_slopes(
+    z_th: Rational, z_load: Rational, v_th: Float[AnyArray, " time"], of_load: bool
+) -> tuple[Float[AnyArray, " time"], Float[AnyArray, "coefficient time"]]:
+    """`terminal_voltage`, and its derivatives by the coefficients of Z_L or of Z_th.
+
+    With N_L D_th = F and F + N_th D_L = C,
+
+        ∂V/∂N_L = D_th/C (V_th − V),   ∂V/∂D_L = −N_th/C V,
+        ∂V/∂N_th = −D_L/C V,           ∂V/∂D_th = N_L/C (V_th − V),
+
+    each delayed by the power of its coefficient; D has no derivative by its first one, 1.
+    """
+    forward, closed, _ = _closed_loop(z_th, z_load)
+    v = from_rest(forward, closed, v_th)
+    if of_load:
+        by_num = from_rest(z_th.den, closed, v_th - v)
+        by_den = -from_rest(z_th.num, closed, v)
+    else:
+        by_num = -from_rest(z_load.den, closed, v)
+        by_den = from_rest(z_load.num, closed, v_th - v)
+    of = z_load if of_load else z_th
+    parts = [*delayed(by_num[None], range(of.num.shape[0])),
+             *delayed(by_den[None], range(1, of.den.shape[0]))]  # fmt: skip
+    return v, namespace(v).concatenate(parts)
 
 
 def _or_infinite(error: Float[AnyArray, ""], stable: Bool[AnyArray, ""]) -> Float[AnyArray, ""]:
@@ -193,10 +226,11 @@ def _or_infinite(error: Float[AnyArray, ""], stable: Bool[AnyArray, ""]) -> Floa
     return xp.where(stable & xp.isfinite(error), error, np.inf)
 
 
+@array_function
 def driver_filter(
-    v_th: Float[Array, "record time"],
-    v_out: Float[Array, "record time"],
-    r_load: Float[Array, " record"],
+    v_th: Float[AnyArray, "record time"],
+    v_out: Float[AnyArray, "record time"],
+    r_load: Float[AnyArray, " record"],
     order: int,
     iterations: int = ITERATIONS,
 ) -> Iterate:
@@ -204,22 +238,27 @@ def driver_filter(
 
     Z_th = (α₀ + … + α₄ z⁻⁴) / (1 + β₁ z⁻¹ + … + β₅ z⁻⁵)                (4)
     """
+    xp = namespace(v_th)
 
-    def assess(candidate: Rational) -> Float[Array, ""]:
-        def one(
-            v_th: Float[Array, " time"], v_out: Float[Array, " time"], r: Float[Array, ""]
-        ) -> Float[Array, ""]:
-            load = Rational(r[None], jnp.ones(1, r.dtype))
-            predicted, stable = terminal_voltage(candidate, load, v_th)
-            return _or_infinite(rrse(predicted, v_out), stable)
-
-        return jax.vmap(one)(v_th, v_out, r_load).max()
+    def assess(candidate: Rational) -> Float[AnyArray, ""]:
+        errors = []
+        for number in range(r_load.shape[0]):
+            of = candidate, resistor(r_load[number]), v_th[number]
+            predicted, stable = terminal_voltage(*of)
+            errors.append(_or_infinite(rrse(predicted, v_out[number]), stable))
+        return xp.stack(errors).max()
 
     w = r_load[:, None] * (v_th - v_out)
     solve = in_time(v_out, w, order - 1, order)
-    return iterate(solve, order - 1, no_poles(jnp, order), assess, iterations)
+    return iterate(solve, order - 1, no_poles(xp, order), assess, iterations)
 
 
+def resistor(r: Float[AnyArray, ""]) -> Rational:
+    """A resistor as a filter."""
+    return Rational(r[None], namespace(r).ones(1))
+
+
+@array_function
 def periodic_driver_filter(
     spectra: Spectrum,
     r_load: Float[AnyArray, " record"],
@@ -256,21 +295,22 @@ def periodic_driver_filter(
     return iterate(solve, order - 1, no_poles(xp, order), assess)
 
 
+@array_function
 def skin_filter(
-    v_th: Float[Array, " time"],
-    v_out: Float[Array, " time"],
+    v_th: Float[AnyArray, " time"],
+    v_out: Float[AnyArray, " time"],
     z_th: Rational,
     iterations: int = ITERATIONS,
 ) -> Iterate:
     """Identify the discrete first-order Z_bio (paper, eqs. 7-9)."""
 
-    def assess(candidate: Rational) -> Float[Array, ""]:
+    def assess(candidate: Rational) -> Float[AnyArray, ""]:
         predicted, stable = terminal_voltage(z_th, candidate, v_th)
         return _or_infinite(rrse(predicted, v_out), stable)
 
-    w = lfilter(z_th.num, z_th.den, v_out)[0]
+    w = from_rest(z_th.num, z_th.den, v_out)
     solve = in_time((v_th - v_out)[None], w[None], 1, 1)
-    return iterate(solve, 1, no_poles(jnp, 1), assess, iterations)
+    return iterate(solve, 1, no_poles(namespace(v_th), 1), assess, iterations)
 
 
 def skin_elements(z_bio: Rational, sample_rate: Float[AnyArray, ""] | float) -> SkinRC:
