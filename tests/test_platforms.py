@@ -61,7 +61,7 @@ def lowered(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", DRIVERS)
 def test_a_batch_is_lowered_for_cuda(lowered, study, drivers, method, monkeypatch):
-    monkeypatch.setattr(fitting, "ROWS", False)  # accelerators run the traced program
+    monkeypatch.setattr(fitting, "ROWS", False)  # accelerators run programs of JAX
     driver = drivers[DRIVERS[method]]
     with lowered("_chunk"):
         etid.identify_skins(study.loaded, driver, method=method)

@@ -57,7 +57,7 @@ HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, bu
 # Relative standard deviation of the resonance, above which loads are searched twice. At 60 dB and
 # 100 kHz it is 0.17 to 1.2 of 28 transformers that resonate at 95 kHz, of others 0.01 to 0.03.
 OPEN = 0.1
-ROWS = True  # whether NumPy fits harmonics as rows; if not, as a traced program
+ROWS = True  # whether NumPy fits harmonics as rows; if not, JAX does
 _Outcome = TypeVar("_Outcome", Fit, Driver)
 
 
