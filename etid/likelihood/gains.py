@@ -169,6 +169,10 @@ class Gains:
         cycles = -self.split(q)[1] * (self.frequency[..., :1] / self.sample_rate)
         return self.undelayed(q) * turns(cycles, self.frequency.shape[-1])
 
+    def at_few(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
+        """The same at frequencies that are no multiples of the first one."""
+        return self.undelayed(q) * self._turn(self.split(q)[1])
+
     def undelayed(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
         """The same without the delays."""
         at, z = self.impedance(q), self.split(q)[2]

@@ -322,7 +322,7 @@ def _search(
                 part = step(load.of(live), at_knots.of(live), taken(state, live))
                 state = replaced(state, live, part)
     else:
-        start = _best(load, starts)
+        start = _best(load, at_knots, starts)
         if load.gains.outputs.count > 1:
             start = _approached(load, at_knots, Near.of(load, at_knots, start)).q
         # Only the loop evaluates the likelihood: each copy of its text compiles for a second.
@@ -353,17 +353,33 @@ def _likeliest(load: Load, at_knots: Gains, starts: Float[AnyArray, "start *row 
     if len(starts) == 1 or not far.any():
         return first
     rows, of = np.flatnonzero(far), load.of(np.flatnonzero(far))
-    near = Near.of(of, at_knots.of(rows), _best(of, starts[:, rows]))
+    near = Near.of(of, at_knots.of(rows), _best(of, at_knots.of(rows), starts[:, rows]))
     return replaced(first, rows, near) if rows.size < far.size else near
 
 
-def _best(load: Load, starts: Float[AnyArray, "start *row q"]) -> Float[AnyArray, "*row q"]:
-    """The first start, or the best of all where its χ² is large."""
-    xp, objectives = namespace(starts), load.objective(starts)
-    near = 2 * objectives[0] < NEAR * load.records.terms
-    objectives = xp.where(xp.isfinite(objectives), objectives, np.inf)
-    place = xp.where(near, 0, xp.argmin(objectives, axis=0))
+def _best(
+    load: Load, at_knots: Gains, starts: Float[AnyArray, "start *row q"]
+) -> Float[AnyArray, "*row q"]:
+    """The first start, or the best of all where its χ² is large.
+
+    The harmonics at the knots tell starts apart, at a fifteenth of the time of all.
+    """
+    xp, index = namespace(starts), load.knots.index
+    few = Records(*(each[..., index] for each in load.known(starts[0])))
+    objectives = Profile.of(few, at_knots.at_few(starts)).objective
+    objectives = objectives + 0.5 * (load.rest(starts) ** 2).sum(-1)
+    place = likeliest(objectives, few.terms)
     return xp.take_along_axis(starts, place[None, ..., None], 0)[0]
+
+
+def likeliest(
+    objectives: Float[AnyArray, "start *row"], terms: Float[AnyArray, "*row"]
+) -> Int[AnyArray, "*row"]:
+    """Number of the first start, or of the best of all where its χ² is large."""
+    xp = namespace(objectives)
+    near = 2 * objectives[0] < NEAR * terms
+    objectives = xp.where(xp.isfinite(objectives), objectives, np.inf)
+    return xp.where(near, 0, xp.argmin(objectives, axis=0))
 
 
 def _approached(load: Load, at_knots: Gains, near: Near) -> Near:

@@ -118,13 +118,15 @@ def _by_current(
     ratio = xp.where(weight > 0, sizes[0] / xp.where(weight > 0, sizes[1], 1.0), 1.0)
     size = 0.5 * xp.log(ratio)
     typical, (by_size, by_time) = _typical(circuit), circuit.scaling()
-    delays, found = xp.zeros((*size.shape[:-1], load.gains.outputs.count)), []
-    for scale in TIME_SCALES:
-        logs = typical + np.log(scale) * by_time + xp.zeros((*size.shape[:-1], 1))
-        off = size - 0.5 * xp.log(power(impedance_at(circuit, logs, load.gains.frequency)))
-        level = (weight * off).sum(-1) / weight.sum(-1)
-        found.append(xp.concatenate([logs + level[..., None] * by_size, delays], -1))
-    return xp.stack(found[::-1])
+    own = (len(TIME_SCALES), *size.shape[:-1])
+    logs = xp.zeros((*own, 1)) + typical
+    logs = logs + xp.asarray(np.log(TIME_SCALES)).reshape(-1, *[1] * size.ndim) * by_time
+    every = load.knots  # Z is smooth, the weights are not
+    z = impedance_at(circuit, logs, every.at(load.gains.frequency))
+    off = (weight * size).sum(-1) - 0.5 * (every.summed(weight) * xp.log(power(z))).sum(-1)
+    level = (off / weight.sum(-1))[..., None] * by_size
+    delays = xp.zeros((*own, load.gains.outputs.count))
+    return xp.concatenate([logs + level, delays], -1)[::-1]
 
 
 def _steiglitz_mcbride(load: Load) -> Float[AnyArray, "*row coefficient"]:
