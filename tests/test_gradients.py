@@ -143,6 +143,7 @@ def unfitted(monkeypatch):
 
     monkeypatch.setattr(samples, "skin_lane", seen)
     driver = object.__new__(HarmonicDriver)  # whose numbers nobody reads
+    monkeypatch.setattr(samples, "_may_share", lambda *_: False)
     for name in ("known", "check_driver"):
         monkeypatch.setattr(MaximumLikelihood, name, lambda *_: None)
 

@@ -105,3 +105,13 @@ def test_many_rows_are_exported_for_accelerators(of, records, driver):
     program = export.export(jax.jit(every), platforms=["cuda", "tpu"])(shape)
     assert program.platforms == ("cuda", "tpu")
     assert "callback" not in program.mlir_module()
+
+
+def test_arrays_with_the_unloaded_record_of_a_calibration_tell_of_it_twice():
+    """Without that, the error of R_p would be a fifth larger."""
+    trials, known = (Trial("a", SKINS[0]),), (Trial("c", ResistorLoad(98.8e3)),)
+    study = Scene(trials, known, snr_db=60.0, shared_v_th=True).simulate(seed=2)
+    driver, one = etid.identify_driver(study["c"]), study["a"]
+    fit = etid.identify_samples(np.asarray(one.v_th), np.asarray(one.v_out), driver, **RATES)
+    expected = etid.identify_skin(one, driver)
+    np.testing.assert_allclose(fit.stderr.values(), expected.stderr.values(), rtol=0.01)

@@ -18,9 +18,10 @@ from etid.precision import in_float64, namespace, untraced
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
-from etid.signals.harmonics import whole_periods
+from etid.signals.harmonics import harmonics, same_unloaded, whole_periods
 from etid.signals.missing import unmasked
 from etid.signals.noise import Measurement, floor, noise
+from etid.signals.transfer import AnyArray
 
 
 @in_float64
@@ -69,6 +70,7 @@ def identify_samples(
         estimator = _default(driver, periods[0])
         check_default(estimator, options.circuits)
     estimator.check_driver(driver, sample_rate)
+    recorded = unmasked(v_th)
     v_th, v_out, step = (jnp.asarray(unmasked(value), float) for value in (v_th, v_out, resolution))
     rate = untraced(unmasked(sample_rate))
     # At harmonics the noise is measured, and its floor is needed only. White noise is a median: by
@@ -76,11 +78,10 @@ def identify_samples(
     of = floor if estimator.lane.periodic else noise
     of_th, of_out = (jax.lax.stop_gradient(jnp.asarray(of(v, step))) for v in (v_th, v_out))
     lane = estimator.lane.of_samples(Measurement(v_th, v_out, of_th, of_out, rate), periods)
-    known = (
-        estimator.known(*untraced((driver, lane.frequency)), True)
-        if isinstance(lane, Harmonics)
-        else None
-    )
+    known = None
+    if isinstance(lane, Harmonics):
+        shared = _may_share(recorded, driver, periods)
+        known = estimator.known(*untraced((driver, lane.frequency)), shared)
     fit = skin_lane(lane, driver, known, options.circuit, estimator)
     # No harmonic is left out here, so a remark about hum would be untrue.
     remarks = fit.remarks & ~int(Remark.mains_hum)
@@ -90,3 +91,17 @@ def identify_samples(
 def _default(driver: Driver, periods: int) -> AbstractEstimator:
     several = isinstance(driver, HarmonicDriver) and periods > 1
     return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
+
+
+def _may_share(recorded: AnyArray, driver: Driver, periods: tuple[int, int]) -> bool:
+    """Whether an unloaded record may be that of a calibration; what JAX traces may be.
+
+    Without one that they share, a program and its derivative are a fifth smaller.
+    """
+    if not isinstance(driver, HarmonicDriver):
+        return False
+    recorded, known = untraced((recorded, driver.spectra.x))
+    if not isinstance(known, np.ndarray):
+        return True
+    x = harmonics(recorded.astype(float), *periods)
+    return bool(np.any(same_unloaded(x, known[:, : x.size])))

@@ -65,9 +65,9 @@ class Spectrum(Module):
 
 
 def same_unloaded(
-    one: Complex[AnyArray, "*row harmonic"], other: Complex[AnyArray, "*#row _"]
-) -> Bool[AnyArray, "*row"] | bool:
-    """Whether the X of two recordings are transforms of the same unloaded record."""
+    one: Complex[AnyArray, "... harmonic"], other: Complex[AnyArray, "... _"]
+) -> Bool[AnyArray, "..."] | bool:
+    """Whether the X of recordings are transforms of the same unloaded record."""
     if one is other:
         return True
     if one.shape[-1] != other.shape[-1]:
