@@ -44,7 +44,7 @@ def scores_of(number: int, snr_db: float, parts: float) -> dict[str, dict[str, l
         return {}
     found = {}
     for one in of.loaded.recordings():
-        lane = Harmonics.of(Inspected(one))
+        lane = Harmonics.of(Inspected.of(one))
         known = known_of(lane, driver, False, MAXIMUM_LIKELIHOOD)
         load = loads_of([lane], source_of(known), SkinRC(), None, None)
         scores = fit(load, starts(load)).tested

@@ -123,7 +123,7 @@ class Drivers:
     def kind(self, calibrations: Sequence[etid.Recording], name: str) -> str:
         """The method that identifies the driver: on the harmonics, that of maximum likelihood."""
         if name == DEFAULT:
-            name = str(for_calibrations(None, [Inspected(record) for record in calibrations]))
+            name = str(for_calibrations(None, [Inspected.of(record) for record in calibrations]))
         return "maximum_likelihood" if named(name).lane.periodic else name
 
     def of(self, calibrations: Sequence[etid.Recording], name: str) -> etid.Driver | None:

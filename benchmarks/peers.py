@@ -89,7 +89,7 @@ def terms(own: Float[AnyArray, " own"], load: Load) -> Float[AnyArray, " term"]:
 
 def harmonics(record: etid.Recording) -> Harmonics:
     """The lane of a trial: harmonics and noise."""
-    return Harmonics.of(Inspected(record))
+    return Harmonics.of(Inspected.of(record))
 
 
 def problem_of(study: etid.Study, driver: etid.Driver) -> Problem:

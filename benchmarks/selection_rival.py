@@ -73,7 +73,7 @@ def measured(snr_db: float, number: int) -> Spectra:
     """Spectra from the recordings of `benchmarks.selection_draws.draws`."""
     study = scene(snr_db, number).simulate(number)
     driver = etid.identify_driver(study["calibration"])
-    lanes = [Harmonics.of(Inspected(study[name])) for name in TRUTHS]
+    lanes = [Harmonics.of(Inspected.of(study[name])) for name in TRUTHS]
     f = np.asarray(lanes[0].spectrum.frequency)
     z_th = np.asarray(driver.response(jnp.asarray(f)))
     found = []

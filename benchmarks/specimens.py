@@ -121,7 +121,7 @@ def _use_recordings(path: pathlib.Path, seed: int) -> None:
         study.where(subject="s01")
         for name in study:
             with contextlib.suppress(etid.RecordingError):
-                preflight(Inspected(study[name]), periodic=True)
+                preflight(Inspected.of(study[name]), periodic=True)
         for name in study.problems:
             str(study.problems[name])
         if problems == [] and seed % 4 == 0:

@@ -61,9 +61,9 @@ def test_the_lag_is_found_to_less_than_a_sample(sample_rate, snr_db, late):
 
 def test_opposite_polarity_and_lags_out_of_reach_are_misaligned():
     record = simulate(periods=1.0)["damp"]
-    assert Inspected(record.replace(v_out=-record.v_out)).correlated is None
+    assert np.isnan(Inspected.of(record.replace(v_out=-record.v_out)).correlated)
     for late in (450.0, -450.0):
-        assert preflight(Inspected(simulate(late, periods=1.0)["damp"])) == "misaligned"
+        assert preflight(Inspected.of(simulate(late, periods=1.0)["damp"])) == "misaligned"
 
 
 @pytest.mark.parametrize("width", [2.5e-3, 1 / 120, 12e-3])
@@ -71,18 +71,17 @@ def test_a_long_pulse_is_not_taken_for_one_of_the_other_polarity(width):
     """Its two edges are alike but for their signs; at half a period, so are those of half of it."""
     for seed in range(5):
         record = simulate(50.3, seed=seed, width=width)["damp"]
-        lag = Inspected(record).correlated
-        assert lag is not None
+        lag = Inspected.of(record).correlated
         assert abs(lag - 50.3) < 1.0
-        assert Inspected(record.replace(v_out=-record.v_out)).correlated is None
+        assert np.isnan(Inspected.of(record.replace(v_out=-record.v_out)).correlated)
 
 
 @pytest.mark.parametrize("late", [3, -120])
 def test_what_is_fitted_does_not_depend_on_whole_samples(late):
     """To the steps of a 16-bit converter: nothing wraps around, and the phases are exact."""
-    there, here = Inspected(simulate(late, snr_db=None)["dry"]), simulate(snr_db=None)["dry"]
+    there, here = Inspected.of(simulate(late, snr_db=None)["dry"]), simulate(snr_db=None)["dry"]
     assert there.lag == late
-    harmonic, right = Harmonics.of(there), Harmonics.of(Inspected(here))
+    harmonic, right = Harmonics.of(there), Harmonics.of(Inspected.of(here))
     step = 10 / 2**15 / 0.0535  # rounding of two records, shared by 10 000 samples
     np.testing.assert_allclose(harmonic.y, right.y, atol=6 * step / np.sqrt(10_000))
     padded = PaddedSamples.of(there)
@@ -108,7 +107,7 @@ def test_elements_are_those_without_the_delay(driver):
     # The prediction is that of the record as it is: to its noise, 10 mV, and that of V_th.
     circuit = etid.SkinRC(*map(float, np.asarray(fits.circuit.values())[0]))
     rest = etid.predict(records[0], driver, circuit) - records[0].v_out
-    assert np.nanstd(rest) < 2 * np.sqrt(2) * float(Inspected(records[0]).sigma[1])
+    assert np.nanstd(rest) < 2 * np.sqrt(2) * float(Inspected.of(records[0]).sigma[1])
 
 
 def test_a_calibration_that_is_late_serves_as_well():
@@ -120,7 +119,7 @@ def test_a_calibration_that_is_late_serves_as_well():
 
 def test_what_looks_later_than_it_is_is_aligned_again(driver, monkeypatch):
     """Edges that a load smoothes may be found two samples late: the misfit tells how many."""
-    monkeypatch.setattr("etid.recordings.preflight.whole_lag", lambda lag: round(lag) - 2)
+    monkeypatch.setattr("etid.recordings.inspection.whole_lag", lambda lag: round(lag) - 2)
     record = simulate(7.0, seed=8)["dry"]
     alone = etid.identify_skin(record, driver)
     fits = etid.identify_skins([record, simulate(0.0, seed=9)["dry"]], driver)

@@ -148,4 +148,4 @@ def test_a_steep_filter_leaves_no_aliases_where_the_clocks_agree():
     )
     scene = dataclasses.replace(scene, trials=scene.trials[:3])
     for one in scene.simulate(seed=0).loaded.recordings():
-        assert Inspected(one).aliases is None
+        assert Inspected.of(one).aliases is None

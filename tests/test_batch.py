@@ -137,7 +137,7 @@ def test_long_recordings_are_fitted_in_calls_of_fewer_lanes(study, monkeypatch):
     batch = fitting.Batch(fitting.Prepared(*[nothing] * len(fitting.Prepared._fields)))
     for row, recording in enumerate(study.loaded.recordings()):
         assert not batch.full
-        batch.add(row, batch.like._replace(seen=Inspected(recording)))
+        batch.add(row, batch.like._replace(seen=Inspected.of(recording)))
     assert batch.full
 
 

@@ -47,7 +47,7 @@ def noisy(seed, *, filtered, snr_db=50.0, scene=SCENE):
 def shown(recording, driver, circuit, found):
     """What the picture shows by frequency."""
     of, feed = continuous(recording, driver)
-    return by_frequency(Inspected(of), feed, circuit, found)
+    return by_frequency(Inspected.of(of), feed, circuit, found)
 
 
 class Judged:
@@ -69,14 +69,14 @@ def judged(request):
 
 def test_the_line_is_the_noise_that_weights_the_fit(judged):
     of, _ = judged
-    lane = Harmonics.of(Inspected(of.recording))
+    lane = Harmonics.of(Inspected.of(of.recording))
     z = of.fit.circuit.response(jnp.asarray(lane.frequency))
     gain = np.asarray(of.driver.gain(z, jnp.asarray(lane.frequency)))
     weighed = (lane.variance_y + np.abs(gain) ** 2 * lane.variance_x)[lane.selected]
     axis = of.fit.plot()[2]
     (line,) = [one for one in axis.lines if one.get_linestyle() == "-"]
     np.testing.assert_allclose(line.get_xdata(), 1e-3 * lane.frequency[lane.selected])
-    samples = Inspected(of.recording).periods[1]
+    samples = Inspected.of(of.recording).periods[1]
     unit = 1e-6 if "µV" in axis.get_ylabel() else 1e-9
     density = np.sqrt(2 * samples / of.recording.sample_rate * weighed)
     # The fit moves Z_th within its standard error, which is below 1 % in |G|.
@@ -125,7 +125,7 @@ def test_the_band_in_time_is_that_of_the_noise_of_both_records(judged):
     f = jnp.asarray(np.fft.rfftfreq(of_th.size, 1 / of.recording.sample_rate))
     gain = np.asarray(of.driver.gain(pictures.SKIN.response(f), f))
     through = np.fft.irfft(np.fft.rfft(of_th) * gain, of_th.size)
-    sigma = sample_std(Inspected(of.recording), of.driver, pictures.SKIN)
+    sigma = sample_std(Inspected.of(of.recording), of.driver, pictures.SKIN)
     assert sigma == pytest.approx(np.std(through - of_out), rel=0.06)
 
 

@@ -47,7 +47,7 @@ def falling(load, name, share, periods=3):
 
 
 def repeats_of(recording):
-    [of] = repeats([Inspected(recording)])
+    [of] = repeats([Inspected.of(recording)])
     assert of is not None
     return of
 

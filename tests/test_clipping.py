@@ -79,7 +79,7 @@ def test_drawn_drivers_pass_with_converters_of_all_bits():
             step = float(held["lsb"]) * 2 ** (16 - bits)
             th, out = np.rint(codes * held["lsb"] / step) * step / held["scale"]
             one = Recording(th, out, sample_rate=float(held["fs"]), pulse_rate=float(held["f0"]))
-            assert preflight(Inspected(one)) is None
+            assert preflight(Inspected.of(one)) is None
 
 
 def test_a_value_with_few_samples_beside_the_rail_is_no_clipping():
@@ -97,7 +97,7 @@ def test_a_value_with_few_samples_beside_the_rail_is_no_clipping():
 
 def judged(v_th, v_out, **fields):
     one = etid.Recording(v_th, v_out, sample_rate=RATE, pulse_rate=60.0, **fields)
-    return preflight(Inspected(one))
+    return preflight(Inspected.of(one))
 
 
 @pytest.fixture(scope="module", params=["dry", "damp"])
@@ -164,4 +164,4 @@ def test_a_stimulator_that_holds_its_voltage_is_not_clipped():
     rng = np.random.default_rng(0)
     v_out, i = (v + 1e-3 * np.ptp(v) * rng.standard_normal(SAMPLES) for v in (held, current))
     one = etid.Recording(v_out=v_out, current=i, sample_rate=RATE, pulse_rate=60.0)
-    assert preflight(Inspected(one)) is None
+    assert preflight(Inspected.of(one)) is None

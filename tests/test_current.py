@@ -250,14 +250,14 @@ def test_the_cause_of_a_misaligned_current_is_named(load, snr_db):
         (-np.roll(v, -300), rf"^v_out is early by (299|300) samples .*records\. {sign}$"),
         (other, "^The cause is not clear"),  # half a period away
     ):
-        assert re.search(words, why_misaligned(Inspected(right.replace(v_out=v_out))))
+        assert re.search(words, why_misaligned(Inspected.of(right.replace(v_out=v_out))))
 
 
 @pytest.mark.parametrize("late", [1, 5, 40])
 def test_a_late_capacitor_is_not_mistaken_for_a_wrong_sign(late):
     """Its voltage then falls with the current at every frequency, as with the wrong sign."""
     right = recorded(etid.SkinRC(10.0, 1e6, 1e-7))
-    seen = Inspected(right.replace(v_out=np.roll(right.v_out, late)))
+    seen = Inspected.of(right.replace(v_out=np.roll(right.v_out, late)))
     assert preflight(seen) == "misaligned"
     assert why_misaligned(seen).startswith("The cause is not clear")
 
@@ -265,6 +265,6 @@ def test_a_late_capacitor_is_not_mistaken_for_a_wrong_sign(late):
 def test_a_current_that_its_converter_clips_is_refused(skin):
     clipped = skin.replace(current=np.minimum(skin.current, 0.8 * skin.current.max()))
     for record, verdict in ((skin, None), (clipped, "saturated")):
-        assert preflight(Inspected(record)) == verdict
+        assert preflight(Inspected.of(record)) == verdict
         ranged = record.replace(adc_range=(-1e4, 1e4))  # that of the voltages
-        assert preflight(Inspected(ranged)) == verdict
+        assert preflight(Inspected.of(ranged)) == verdict

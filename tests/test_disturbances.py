@@ -69,17 +69,17 @@ def test_a_disturbance_over_a_joint_disturbs_both_periods():
     """Its rest in the second period was kept: R_p 3 % wrong, six standard errors, at 40 dB."""
     six = trial(rung("dry", snr_db=40.0, samples=20_000), 1)
     long = with_spike(six, 2.12, width=5e-3, which="v_th")  # from 2.72 to 3.02 periods
-    kept = Inspected(long).kept
+    kept = Inspected.of(long).kept
     assert kept is not None
     np.testing.assert_array_equal(kept.first, [0, 3333, 13_334, 16_667])
     # Of three periods one would remain, so the period with the larger part is left out.
     three = with_spike(trial(rung("dry"), 1), 0.12, 0.2, "v_th", 5e-3)
-    assert Inspected(three).periods[0] == 2
+    assert Inspected.of(three).periods[0] == 2
 
 
 def test_both_voltages_and_what_is_known_of_them_are_of_the_same_periods():
     recording = trial(rung("dry"), 1)
-    seen = Inspected(with_spike(recording, 1, 1.0))
+    seen = Inspected.of(with_spike(recording, 1, 1.0))
     assert seen.kept is not None
     assert seen.periods == (2, 6667)
     kept = np.concatenate([np.arange(3333), np.arange(6666, 10_000)])
@@ -90,7 +90,7 @@ def test_both_voltages_and_what_is_known_of_them_are_of_the_same_periods():
         np.random.default_rng(1).normal(0, 20.0, recording.time.size),
         0.0,
     )
-    noisy = Inspected(recording.replace(v_out=loud))
+    noisy = Inspected.of(recording.replace(v_out=loud))
     assert noisy.kept is not None
     np.testing.assert_allclose(noisy.sigma, seen.sigma)  # the same two periods
 
@@ -118,12 +118,12 @@ def test_no_period_of_an_undisturbed_record_is_left_out(load):
         (10_000, 20_000), (20.0, 30.0, 80.0), (5e-8, 5e-6)
     ):
         scene = rung(load, samples=samples, snr_db=snr_db, trigger_jitter_rms=jitter)
-        assert Inspected(trial(scene, 3)).kept is None
+        assert Inspected.of(trial(scene, 3)).kept is None
     for name in ("r_s", "r_p", "c_p"):  # nor of skin that changes
         scene, skin = rung(load), LOADS[load]
         moves = falling(skin, name, 0.3)
         for loads in (moves, [skin, *moves[1:]][::-1], [skin, skin, moves[-1]]):
-            assert Inspected(recorded(scene, loads)).kept is None
+            assert Inspected.of(recorded(scene, loads)).kept is None
 
 
 def test_another_pulse_of_the_source_is_no_disturbance_and_a_period_at_the_rail_is():
@@ -132,12 +132,12 @@ def test_another_pulse_of_the_source_is_no_disturbance_and_a_period_at_the_rail_
     later = {name: np.roll(getattr(recording, name), 5000) for name in ("v_th", "v_out")}
     inside = (recording.time > 1.2 * PERIOD) & (recording.time < 1.8 * PERIOD)
     both = {name: np.where(inside, later[name], getattr(recording, name)) for name in later}
-    assert Inspected(recording.replace(**both)).kept is None
+    assert Inspected.of(recording.replace(**both)).kept is None
     # In one record it is a fault; the next period differs as well, and is not good without it.
-    assert Inspected(recording.replace(v_out=both["v_out"])).kept is None
+    assert Inspected.of(recording.replace(v_out=both["v_out"])).kept is None
     assert recording.adc_range is not None
     clipped = with_spike(recording, 2, 20.0, width=5e-3)
-    railed = Inspected(clipped.replace(v_out=np.minimum(clipped.v_out, recording.adc_range[1])))
+    railed = Inspected.of(clipped.replace(v_out=np.minimum(clipped.v_out, recording.adc_range[1])))
     assert railed.kept is not None
     assert preflight(railed) is None
 

@@ -64,7 +64,7 @@ def test_the_noise_is_found_beside_any_waveform(kind, rate, periods):
     harmonics. The highest bins of one period of a chirp to 80 kHz hold the signal.
     """
     one, sigma = recorded(kind, periods, 0, rate)
-    ratio = Inspected(one).sigma / sigma
+    ratio = Inspected.of(one).sigma / sigma
     assert (ratio > 0.85).all()
     if (kind, periods) != ("chirp 80", 1):
         assert (ratio < (1.15 if (kind, periods, rate) != ("chirp 80", 2, 60.0) else 1.2)).all()
@@ -94,22 +94,22 @@ def test_one_period_of_any_waveform_is_fitted(kind, rate):
 def test_a_spectrum_that_has_ended_has_no_aliases(kind):
     """By chance, noise above it looked like aliases in one of thirty records: `biased`."""
     for periods, seed in ((1, 3), (1, 6), (4, 6)):
-        seen = Inspected(recorded(kind, periods, seed, 50.0)[0])
+        seen = Inspected.of(recorded(kind, periods, seed, 50.0)[0])
         assert seen.has_no_aliases
         assert not seen.is_aliased
 
 
 @pytest.mark.parametrize("kind", ["flat 72", "flat 90", "pulses"])
 def test_a_spectrum_that_goes_on_may_have_aliases(kind):
-    assert not Inspected(recorded(kind, 1, 0, 50.0)[0]).has_no_aliases
+    assert not Inspected.of(recorded(kind, 1, 0, 50.0)[0]).has_no_aliases
 
 
 def test_a_record_that_does_not_close_has_not_ended():
     """One period that begins with the current: the voltage at the skin is not yet periodic."""
     one, sigma = recorded("flat 36", 1, 0, 50.0)
     charged = 100 * sigma[1] * np.exp(-np.arange(one.v_out.size) / (RATE * 186e3 * 0.12e-9))
-    assert Inspected(one).has_no_aliases
-    assert not Inspected(one.replace(v_out=one.v_out + charged)).has_no_aliases
+    assert Inspected.of(one).has_no_aliases
+    assert not Inspected.of(one.replace(v_out=one.v_out + charged)).has_no_aliases
 
 
 @pytest.mark.slow

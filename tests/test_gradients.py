@@ -159,7 +159,7 @@ def test_arrays_have_the_weights_of_a_recording(unfitted):
     """White noise was a floor besides: where the noise scatters above it, it was kept."""
     records = three_periods()
     one = etid.Recording(*records, sample_rate=334.0, pulse_rate=1.0)
-    found, of = unfitted(*records), Harmonics.of(Inspected(one))
+    found, of = unfitted(*records), Harmonics.of(Inspected.of(one))
     for one, other in ((found.variance_x, of.variance_x), (found.variance_y, of.variance_y)):
         np.testing.assert_allclose(one, other, rtol=1e-9)  # rounding, of 1 002 samples
 

@@ -7,6 +7,8 @@ import etid
 from etid.recordings.preflight import Inspected, inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
+from etid.simulation.scenes import Scene, Trial
+from tests.skins import DAMP, DRY
 
 TOTAL = 20_000
 ROUNDING = 1e-14  # of the largest coefficient: sums of 20 000 samples
@@ -62,7 +64,7 @@ def test_each_recording_is_found_as_it_is_alone(mixed: dict[str, Recording]):
     used = [one for name, one in together.items() if names[name] is None]
     differences = dict(zip(map(id, used), repeats(used), strict=True))
     for name, one in together.items():
-        alone = Inspected(mixed[name])
+        alone = Inspected.of(mixed[name])
         assert preflight(alone, periodic=True) == names[name]
         if names[name] is not None:
             continue
@@ -81,3 +83,25 @@ def test_each_recording_is_found_as_it_is_alone(mixed: dict[str, Recording]):
             # In single precision, and the noise is a thousandth of the signal.
             np.testing.assert_allclose(found.gain, expected.gain, rtol=0, atol=1e-6)
             np.testing.assert_allclose(found.variance, expected.variance, rtol=1e-3)
+
+
+def test_currents_beside_both_voltages_are_found_as_they_are_alone():
+    trials = [Trial(f"loaded/{at}", circuit) for at, circuit in enumerate((DRY, DAMP))]
+    scene = Scene(tuple(trials), (), current_snr_db=40.0)
+    records = list(scene.simulate(seed=2).recordings())
+    current = records[1].current
+    assert current is not None
+    spike = np.zeros(current.size)
+    spike[4_500:4_600] = 1e-3 * np.sin(np.pi * np.arange(100) / 100)
+    records += [records[0].replace(current=current + spike), records[0].replace(current=None)]
+    for record, together in zip(records, inspected(records), strict=True):
+        alone, found = Inspected.of(record).by_current, together.by_current
+        assert (alone is None) == (found is None) == (record.current is None)
+        if alone is None or found is None:
+            continue
+        assert "v_th" not in found.recording.samples
+        assert (found.kept is not None) == (alone.kept is not None) == (record is records[2])
+        assert found.periods == alone.periods
+        assert preflight(found, periodic=True) == preflight(alone, periodic=True)
+        for field, again in zip(alone.spectrum, found.spectrum, strict=True):
+            np.testing.assert_allclose(again, field, rtol=1e-12, atol=ROUNDING * abs(field).max())

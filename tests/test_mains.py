@@ -67,7 +67,7 @@ def test_lines_are_the_harmonics_on_multiples_of_50_or_60_hz():
 )
 def test_hum_between_the_harmonics_is_subtracted(frequency, samples):
     clean = study_of(samples=samples)["calibration/98k8"]
-    seen = Inspected(hummed(clean, frequency, 0.1))
+    seen = Inspected.of(hummed(clean, frequency, 0.1))
     assert seen.remarks == Remark.mains_hum
     periods, length = seen.periods
     left = np.fft.rfft((seen.v_out - clean.v_out)[:length]) / length
@@ -87,7 +87,7 @@ def test_hum_between_the_harmonics_is_subtracted(frequency, samples):
 @pytest.mark.parametrize("snr_db", [20.0, 40.0, 80.0])
 def test_no_hum_is_seen_where_there_is_none(settings, snr_db):
     for recording in study_of(snr_db=snr_db, offset_rms=0.1, **settings).values():
-        assert Inspected(recording).remarks == Remark(0)
+        assert Inspected.of(recording).remarks == Remark(0)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

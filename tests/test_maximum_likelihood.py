@@ -150,7 +150,7 @@ def test_a_record_without_a_whole_period_is_told_so_or_goes_to_output_error(stud
     short = record.replace(v_th=record.v_th[:3332], v_out=record.v_out[:3332])
     with pytest.raises(etid.IdentificationError, match="not_periodic"):
         etid.identify_skin(short, driver, method="maximum_likelihood")
-    assert plan(Options(), Inspected(short), driver) == (registry.OUTPUT_ERROR, None)
+    assert plan(Options(), Inspected.of(short), driver) == (registry.OUTPUT_ERROR, None)
     known = study["calibration/0"]
     steep = int(np.argmax(np.abs(np.diff(known.v_th))))  # a period cut within an edge is none
     part = slice(steep, steep + 3333)
@@ -180,7 +180,7 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
 
 
 def test_the_search_at_the_knots_ends_at_the_minimum_of_all_harmonics(study, driver):
-    lane = Harmonics.of(Inspected(study["loaded/0"]))
+    lane = Harmonics.of(Inspected.of(study["loaded/0"]))
     known = known_of(lane, driver, True, MAXIMUM_LIKELIHOOD)
     of = loads_of([lane], source_of(known), SkinRC(), None, calibrated(known))
     start = np.concatenate([np.log([30e3, 150e3, 0.2e-9]), [0.3], known.mean])

@@ -46,7 +46,7 @@ def scene():
     known = (Trial("c", ResistorLoad(98.8e3)),)
     skin = etid.SkinRC(**SKIN)
     study = Scene((Trial("a", skin),), known, samples=10_000, snr_db=60.0).simulate(seed=3)
-    lane = Harmonics.of(Inspected(study["a"]))
+    lane = Harmonics.of(Inspected.of(study["a"]))
     driver = etid.identify_driver(study["c"])
     assert isinstance(driver, HarmonicDriver)
     return lane, source_of(known_of(lane, driver, False, MAXIMUM_LIKELIHOOD))

@@ -78,7 +78,7 @@ def test_an_unloaded_record_of_another_quartz_has_its_own_period():
     record = study["cal/0"].replace(v_th=v[0], v_out=v[1])
     tracker = Tracker.of(driver, record, electrodes=TEN)
     assert tracker.period == pytest.approx(PERIOD * (1 + 1e-6 * ppm), abs=1e-6 * PERIOD)
-    assert Inspected(study["cal/0"]).exact_spacing == PERIOD
+    assert Inspected.of(study["cal/0"]).exact_spacing == PERIOD
 
 
 def blocks(v, size=500):

@@ -160,7 +160,7 @@ def fitted():
     kept_numbers.check("driver_in_time", kept_numbers.of_driver(driver))
 
     def of(scale, late=driver.calibration.delay_std_samples, **other):
-        lane = PaddedSamples.of(Inspected(study["a"]))
+        lane = PaddedSamples.of(Inspected.of(study["a"]))
         told = jax.tree.map(jnp.asarray, lane)
         lane = dataclasses.replace(
             told, sigma_th=scale * told.sigma_th, sigma_out=scale * told.sigma_out

@@ -92,7 +92,7 @@ def test_a_fit_shows_its_residual_in_millivolts_in_a_band_of_two_sigma(recording
     np.testing.assert_allclose(y(lower.lines[-1]), 1e3 * (y(upper.lines[2]) - y(upper.lines[1])))
     (band,) = lower.patches
     assert isinstance(band, Rectangle)
-    sigma = 1e3 * sample_std(Inspected(recording), driver, fit.circuit)
+    sigma = 1e3 * sample_std(Inspected.of(recording), driver, fit.circuit)
     np.testing.assert_allclose((band.get_y(), band.get_height()), (-2 * sigma, 4 * sigma))
     assert r"successful, χ² 1.02, RRSE 0.1 %" in title(upper)
     assert r"$R_\mathrm{s}$ 33.40 ± 0.67 kΩ" in title(upper)
@@ -120,7 +120,7 @@ def test_what_did_not_succeed_looks_so(recording, driver):
 @pytest.fixture(scope="module")
 def found(driver):
     """Bands of the skin that is not one RC, for its circuit and the nearest other one."""
-    lane = Harmonics.of(Inspected(pictures.spread()))
+    lane = Harmonics.of(Inspected.of(pictures.spread()))
     return [bands(lane, driver, circuit) for circuit in (pictures.SPREAD, pictures.NEAREST)]
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import etid
 from etid.identify.planning import explained
 from etid.recordings.causes import why_misaligned
-from etid.recordings.group import SHORTEST
+from etid.recordings.inspection import SHORTEST
 from etid.recordings.preflight import Inspected
 from etid.recordings.preflight import preflight as of_inspected
 from etid.simulation.scenes import Scene, Trial
@@ -23,7 +23,7 @@ DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
 
 
 def preflight(recording):
-    return of_inspected(Inspected(recording))
+    return of_inspected(Inspected.of(recording))
 
 
 def simulate(load: Any = DAMP, seed=0, samples=LENGTH, **options):
@@ -109,9 +109,9 @@ def test_a_single_sample_at_the_known_rail_is_saturated(recording):
 def test_the_cause_of_misaligned_records_is_named(recording, change, words):
     changed = recording.replace(v_out=change(recording.v_out), adc_range=None)
     assert preflight(changed) == "misaligned"
-    why = why_misaligned(Inspected(changed))
+    why = why_misaligned(Inspected.of(changed))
     assert re.search(words, why)
-    assert explained(Inspected(changed), "misaligned").startswith(why)
+    assert explained(Inspected.of(changed), "misaligned").startswith(why)
 
 
 def test_the_shortest_record_is_named_before_anything_else():

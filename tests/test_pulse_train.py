@@ -57,9 +57,9 @@ def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
     record = noisy.replace(v_th=noisy.v_th[:size], v_out=noisy.v_out[:size], adc_range=None)
     for changes in ({"sample_rate": factor * rate}, {"pulse_rate": PULSE / factor}):
         wrong = record.replace(**changes)
-        assert preflight(Inspected(wrong)) == "rate_mismatch"
+        assert preflight(Inspected.of(wrong)) == "rate_mismatch"
         # Either number explains it, to a sample.
-        text = explained(Inspected(wrong), "rate_mismatch")
+        text = explained(Inspected.of(wrong), "rate_mismatch")
         right = wrong.sample_rate * PULSE / rate, wrong.pulse_rate * rate / PULSE
         found = [float(part.split(" Hz")[0]) for part in text.split("rate = ")[1:]]
         np.testing.assert_allclose(found, right[::-1], rtol=2 * PULSE / rate)
@@ -79,7 +79,7 @@ def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
 def test_two_records_with_different_clocks_are_a_mismatch(sample_rate, ppm, snr_db, refused):
     """20 ppm are 0.33 µs from one pulse to the next; R_s was 1.5 % wrong at 60 dB, seven σ."""
     one, other = (simulate(sample_rate, 5.0, snr_db=snr_db, pulse_rate_ppm=of) for of in (0.0, ppm))
-    record = Inspected(one.replace(v_out=other.v_out))
+    record = Inspected.of(one.replace(v_out=other.v_out))
     assert preflight(record) == ("rate_mismatch" if refused else None)
     if refused:
         said = f"their clocks differ by about {abs(ppm):g} ppm"
@@ -90,7 +90,7 @@ def test_two_records_with_different_clocks_are_a_mismatch(sample_rate, ppm, snr_
 @pytest.mark.parametrize("before", [10e-6, 20e-6, 40e-6, 60e-6])
 def test_a_record_that_begins_close_to_an_edge_has_one_clock(sample_rate, before):
     record = simulate(sample_rate, snr_db=60.0, start=1.2e-4 - before)
-    assert preflight(Inspected(record)) is None
+    assert preflight(Inspected.of(record)) is None
 
 
 def test_the_drift_is_from_the_first_pulse_to_the_last():
@@ -122,11 +122,11 @@ def test_a_disturbed_period_is_no_drift():
     for period in (slice(3334), slice(6667, None)):
         v_out = record.v_out.copy()
         v_out[period] *= 0.5
-        assert not Inspected(record.replace(v_out=v_out)).clocks_differ
+        assert not Inspected.of(record.replace(v_out=v_out)).clocks_differ
 
 
 def test_a_period_that_is_given_as_a_rate_is_named(noisy):
-    wrong = Inspected(noisy.replace(pulse_rate=1 / PULSE))
+    wrong = Inspected.of(noisy.replace(pulse_rate=1 / PULSE))
     assert preflight(wrong, periodic=True) == "rate_mismatch"
     assert "pulse_rate is a period in seconds" in explained(wrong, "rate_mismatch")
 
@@ -136,7 +136,7 @@ def test_a_period_that_is_given_as_a_rate_is_named(noisy):
 )
 def test_a_clock_that_is_off_is_counted_and_said(periods, ppm):
     record = simulate(50e3, periods, pulse_rate_ppm=ppm, snr_db=24.0)
-    seen = Inspected(record)
+    seen = Inspected.of(record)
     counted = seen.train.counted / PULSE - 1
     # To half a sample from the first pulse to the last, and not if it is less than that.
     span = (periods - 1) * 50e3 / PULSE

@@ -35,7 +35,7 @@ def as_float(recording):
 @pytest.mark.parametrize("snr_db", [None, 60.0, 80.0])
 def test_the_step_is_seen_in_the_values(bits, snr_db):
     recording = study_of(bits=bits, snr_db=snr_db)["calibration/98k8"]
-    step = Inspected(recording).step[1]
+    step = Inspected.of(recording).step[1]
     np.testing.assert_allclose(noise.step_of(recording.v_out), step, rtol=1e-6)
 
 
@@ -43,8 +43,8 @@ def test_the_step_is_seen_in_the_values(bits, snr_db):
 @pytest.mark.parametrize("bits", [16, None])
 def test_a_fine_converter_is_not_coarse(snr_db, bits):
     for recording in study_of(bits=bits, snr_db=snr_db).values():
-        assert Inspected(recording).remarks == Remark(0)
-        assert Inspected(as_float(recording)).remarks == Remark(0)
+        assert Inspected.of(recording).remarks == Remark(0)
+        assert Inspected.of(as_float(recording)).remarks == Remark(0)
 
 
 def test_noise_of_any_size_is_seen_through_the_steps():
@@ -81,7 +81,7 @@ def test_a_converter_whose_noise_is_a_step_is_weighed_by_its_noise(codes):
     """12 bits of ±10 V at 40 dB: the noise is as large as a step, and was overlooked."""
     for study in (study_of(bits=12, snr_db=40.0), study_of(bits=8, snr_db=20.0)):
         for recording in study.values():
-            seen = Inspected(recording if codes else as_float(recording))
+            seen = Inspected.of(recording if codes else as_float(recording))
             assert not seen.coarse.any()
             assert seen.remarks == Remark(0)
 
@@ -93,7 +93,7 @@ def test_the_size_of_the_rounding_error_is_known_at_each_harmonic(samples):
     settings = {"snr_db": None, "full_scale": 4.0, "sample_rate": rate, "samples": samples}
     exact = study_of(bits=None, **settings)["calibration/98k8"]
     coarse = study_of(bits=8, **settings)["calibration/98k8"]
-    step = Inspected(coarse).step[1]
+    step = Inspected.of(coarse).step[1]
     error = np.abs(harmonics(coarse.v_out - exact.v_out, 3, samples)) ** 2
     known = noise.rounding_variance(coarse.v_out, step, 3, samples)
     bands = [slice(0, 10), slice(10, 100), slice(100, 1000)]

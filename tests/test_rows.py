@@ -40,7 +40,7 @@ def driver(study):
 
 
 def lanes(study):
-    return [Harmonics.of(Inspected(one)) for one in study.loaded.recordings()]
+    return [Harmonics.of(Inspected.of(one)) for one in study.loaded.recordings()]
 
 
 def loads(study, driver, circuit=None, rows=slice(None)):

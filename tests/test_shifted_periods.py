@@ -41,7 +41,7 @@ def test_the_period_after_which_a_sample_is_missing_or_too_many_is_found(
 ):
     for period in range(1, 5):
         one = faulty(records[load], fault, round((period - 0.3) * PERIOD), which)
-        seen = Inspected(one)
+        seen = Inspected.of(one)
         assert seen.shifts is not None
         assert not seen.shifts.bad.any()
         later = (fault == "doubled") == (which == "v_out")
@@ -58,7 +58,7 @@ def test_the_period_after_which_a_sample_is_missing_or_too_many_is_found(
 def test_a_period_whose_pulse_has_the_fault_is_left_out(records, load, fault):
     for period in (0, 2, 5):
         one = faulty(records[load], fault, round(period * PERIOD) + 90)
-        seen = Inspected(one)
+        seen = Inspected.of(one)
         assert seen.shifts is not None
         np.testing.assert_array_equal(np.flatnonzero(seen.shifts.bad), [period])
         assert np.median(np.delete(seen.shifts.late, period)) == 0  # most periods stay in place
@@ -72,11 +72,11 @@ def test_noise_jitter_and_other_skin_do_not_shift_periods(load):
     for snr_db in (20.0, 30.0, 60.0):
         for jitter in (0.0, 5e-6):
             scene = rung(load, snr_db=snr_db, trigger_jitter_rms=jitter)
-            assert Inspected(scene.simulate(3)[TRIAL]).shifts is None
+            assert Inspected.of(scene.simulate(3)[TRIAL]).shifts is None
     for name in ("r_s", "r_p", "c_p"):
         for fall in (0.3, 0.6):
             one = recorded(rung(load), falling(LOADS[load], name, fall))
-            assert Inspected(one).shifts is None
+            assert Inspected.of(one).shifts is None
 
 
 @pytest.mark.parametrize("begins", [0, 200])
@@ -101,7 +101,7 @@ def test_a_record_that_begins_on_an_edge_is_periodic_unless_its_pulses_jitter(be
         sample_rate=rate,
         pulse_rate=pulse_rate,
     )
-    assert Inspected(one).is_periodic == (begins > 0 or not jitters)
+    assert Inspected.of(one).is_periodic == (begins > 0 or not jitters)
 
 
 @pytest.mark.slow

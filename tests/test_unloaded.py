@@ -35,7 +35,7 @@ def study(driver=USUAL, seed=0, **options):
 
 
 def spectrum(recording):
-    return Harmonics.of(Inspected(recording)).fields
+    return Harmonics.of(Inspected.of(recording)).fields
 
 
 def is_other(calibration, spectrum):

@@ -57,7 +57,7 @@ def _remarks(study: Study) -> list[dict[str, str]]:
     """Path and text for each recording that lost samples, or whose impedance no electrode has."""
     found = []
     for path in study:
-        if shifted := how_shifted(Inspected(study[path])):
+        if shifted := how_shifted(Inspected.of(study[path])):
             found.append({"path": path, "message": shifted})
         if all(of.name != "current" for of in study.source(path).layout):
             continue

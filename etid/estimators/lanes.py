@@ -147,7 +147,7 @@ class Harmonics(AbstractLane):
         if joins_aliases(*seen.periods) and not seen.has_no_aliases:
             of_both = zip((x, y), variances, strict=True)
             variances = [v + aliases(of, v, *seen.periods).variance for of, v in of_both]
-        selected = selected & ~seen.covered(frequency)
+        selected = selected & ~seen.covered
         y = y * _turn(frequency, rate, seen.lag) if seen.lag else y
         return frequency, x, y, *variances, selected, rate
 

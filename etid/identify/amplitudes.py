@@ -134,7 +134,7 @@ def identify_amplitudes(
     check_alike("recordings", of)
     fed_by = [fed(one, driver)[0] for one in of]
     check_distinct("recordings", of)
-    seen = [Inspected(one) for one in fed_by]
+    seen = [Inspected.of(one) for one in fed_by]
     for one in seen:
         _, name = plan(options, one, feed)
         if name is not None:

@@ -112,7 +112,7 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
         resistances.append(record.r_load)
     check_alike("calibrations", records)
     check_distinct("calibrations", records)
-    seen = [Inspected(record) for record in records]
+    seen = [Inspected.of(record) for record in records]
     for one in seen:
         _refused(one, preflight(one, periodic=asked is not None and asked.lane.periodic))
     rough = [_rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
@@ -250,7 +250,7 @@ def _lanes(seen: Sequence[Inspected], kind: type[Lane]) -> Lane:
 @in_float64
 def with_harmonics(driver: ContinuousDriver, calibrations: Sequence[Recording]) -> HarmonicDriver:
     """A driver of a file of fits, with the harmonics of its calibrations, which no file holds."""
-    seen = [Inspected(one) for one in calibrations]
+    seen = [Inspected.of(one) for one in calibrations]
     for one in seen:
         _refused(one, preflight(one, periodic=True))
     own = {of.name: getattr(driver, of.name) for of in dataclasses.fields(ContinuousDriver)}

@@ -270,7 +270,7 @@ def given(
             f"the method {MAXIMUM_LIKELIHOOD.name}"
         )
     cov = _determined(fit)
-    seen = Inspected(recording)
+    seen = Inspected.of(recording)
     estimator = cast(MaximumLikelihood, named(fit.method))
     lane = (HarmonicsWithCurrent if estimator.with_current else Harmonics).of(seen)
     late = lane.late_by(fit.circuit, feed)  # as `etid.identify.fitting.refitted` does it

@@ -19,6 +19,7 @@ from etid.estimators.registry import OUTPUT_ERROR
 from etid.identify.arguments import fed, given_circuit
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
+from etid.recordings.inspection import Inspection
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import ContinuousDriver, Driver
@@ -68,12 +69,12 @@ def predict(
         raise ValueError("give the circuit: this recording has no known resistor")
     if not isinstance(feed, MeasuredCurrent):
         feed = serving(feed, ContinuousDriver, str(OUTPUT_ERROR))
-    seen, simulated = Inspected(recording), load.impedance().has_response
+    # Disturbed periods are predicted too.
+    seen, simulated = Inspected(Inspection([recording])), load.impedance().has_response
     if not load.is_rational and (seen.whole_periods[0] > 0 or not simulated):
         if isinstance(feed, ContinuousDriver):
-            return _predict_periods(seen, feed, load)
+            return _predict_periods(Inspected.of(recording), feed, load)
         OUTPUT_ERROR.check_circuit(load)
-    seen.kept = None  # disturbed periods are predicted too
     inner = np.asarray(_fitted(jax.device_put(AlignedSamples.of(seen)), feed, load))
     predicted = np.full(recording.v_out.size, np.nan)
     first = TAPS - 1 + max(seen.lag, 0)

@@ -134,7 +134,7 @@ def candidate_fits(
         ValueError: The method cannot use this driver.
     """
     recording, feed = fed(recording, driver)
-    seen = Inspected(recording)
+    seen = Inspected.of(recording)
     estimator, name = plan(options, seen, feed)
     if name is not None:
         return {0: failed_fit(name, options, str(estimator))}, 0
@@ -156,7 +156,7 @@ def successful(recording: Recording, fit: Fit) -> Fit:
         return fit
     why = fit.note
     if fit.verdict in EXPLAINED:
-        why = explained(Inspected(recording), fit.verdict)
+        why = explained(Inspected.of(recording), fit.verdict)
     raise IdentificationError(f"recording {recording.path!r}: {fit.verdict}. {why}", fit)
 
 

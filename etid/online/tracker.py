@@ -165,7 +165,7 @@ class Tracker(Overviewed, Kept):
         if not (np.isfinite(change) and change >= 0):
             raise ValueError(f"change is {change}; it must be finite and not negative")
         driver = serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
-        seen = Inspected(unloaded)
+        seen = Inspected.of(unloaded)
         name = preflight(seen, periodic=True) or ("biased" if seen.is_aliased else None)
         if name is not None:
             text = f"unloaded recording {unloaded.path!r}: {name}. {explained(seen, name)}"

@@ -41,7 +41,7 @@ def draw_impedance(
     if not listed(fit):
         return _empty(canvas, fit, recording.path)
     recording, known = continuous(recording, driver)
-    lane = used(Inspected(recording), known, fit.circuit, fit.remarks)
+    lane = used(Inspected.of(recording), known, fit.circuit, fit.remarks)
     measured = bands(lane, known, fit.circuit)
     clear = measured.stderr <= CLEAR
     points = measured.frequency[clear], measured.z[clear], measured.stderr[clear]
@@ -155,7 +155,7 @@ def draw_selection(
         judged(axes[0], recording.path, selection.fit)
         return axes
     recording, known = continuous(recording, driver)
-    lane = used(Inspected(recording), known, chosen.fit.circuit, chosen.fit.remarks)
+    lane = used(Inspected.of(recording), known, chosen.fit.circuit, chosen.fit.remarks)
     found = [bands(lane, known, one.fit.circuit) for one in fitted]
     _measured_and_fitted(axes[0], axes[1], fitted, found[0])
     _deviations(axes[2], axes[3], found)

@@ -119,7 +119,7 @@ def _pulse_and_residual(
         return axes
     predicted = predict(recording, driver, load)
     of, feed = continuous(recording, driver)
-    seen = Inspected(of)
+    seen = Inspected.of(of)
     axes = _panels(canvas, 3 if seen.is_periodic and np.isfinite(seen.spans).all() else 2)
     part, time = _draw_measured(axes, recording)
     upper, lower = axes[:2]

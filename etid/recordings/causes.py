@@ -69,7 +69,7 @@ def why_misaligned(inspected: Inspected) -> str:
             "differ; is one of them in mV and the other in V?"
         )
     reversed_lag = _lag(inspected, -inspected.v_out)
-    if inspected.correlated is None and reversed_lag is not None and abs(reversed_lag) <= 1:
+    if np.isnan(inspected.correlated) and reversed_lag is not None and abs(reversed_lag) <= 1:
         return (
             "v_out falls where v_th rises, at the same times. The polarity of one record is "
             "reversed; change its sign, or exchange the two wires of the probe."

@@ -138,12 +138,41 @@ def covariance_of(v: Float[np.ndarray, "*recording 2 time"]) -> Float[np.ndarray
 
 
 def is_periodic(
-    records: Float[np.ndarray, "*recording 2 time"],
-    sigma: Float[np.ndarray, "*recording 2"],
-    rest: Float[np.ndarray, "*recording"],
+    records: Float[np.ndarray, "recording 2 time"],
+    sigma: Float[np.ndarray, "recording 2"],
+    spacing: Float[np.ndarray, " recording"],
+    periods: int,
     samples: int,
-) -> Bool[np.ndarray, "*recording"]:
+    cut: float,
+    counted: Bool[np.ndarray, " recording"],
+) -> Bool[np.ndarray, " recording"]:
     """Whether whole periods have no step from their end to their start.
+
+    Args:
+        records: The records.
+        sigma: Standard deviations of their noise.
+        spacing: Length of a period of each recording [samples].
+        periods: Number of periods.
+        samples: Number of their samples.
+        cut: Largest error of the places at which the periods begin [samples].
+        counted: Whether `spacing` is not the stated one: jitter of the last pulse looks like
+            another pulse rate.
+    """
+    rest = np.maximum(np.abs(periods * spacing - samples), cut)
+    found = _closes(records, sigma, rest, samples)
+    on_edge = found & counted & ~_closes(records, sigma, np.ones(rest.size), samples)
+    for row in np.flatnonzero(on_edge):
+        found[row] = begins_again(records[row], sigma[row], float(spacing[row]), samples)
+    return found
+
+
+def _closes(
+    records: Float[np.ndarray, "recording 2 time"],
+    sigma: Float[np.ndarray, "recording 2"],
+    rest: Float[np.ndarray, " recording"],
+    samples: int,
+) -> Bool[np.ndarray, " recording"]:
+    """Whether records have no step from their end to their start.
 
     Their length differs by `rest` from `samples`, up to half a sample. This makes a step if the
     signal is steep at the joint.

@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from etid.recordings.group import Group
+from etid.recordings.inspection import Inspection
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import quietly
 from etid.signals.deviations import (
@@ -102,16 +102,16 @@ def repeats(inspected: Sequence[Inspected]) -> list[Repeats | None]:
     alike: dict[int, list[int]] = {}
     for number, one in enumerate(inspected):
         if one.periods[0] > 1 and one.is_periodic and not one.coarse.any():
-            alike.setdefault(id(one.used), []).append(number)
+            alike.setdefault(id(one.inspection), []).append(number)
     for numbers in alike.values():
-        group = inspected[numbers[0]].used
-        rows = np.array([inspected[number].place for number in numbers])
+        inspection = inspected[numbers[0]].inspection
+        rows = np.array([inspected[number].row for number in numbers])
         late = np.array([inspected[number].lag for number in numbers])
-        found = _of_rows(group, rows, late, group.quiet)
+        found = _of_rows(inspection, rows, late, inspection.quiet)
         for place, number in enumerate(numbers):
             one = Repeats(*(field[place] for field in found))
             if inspected[number].hums and _differ(one):
-                again = _of_rows(group, rows[[place]], late[[place]], group.whole)
+                again = _of_rows(inspection, rows[[place]], late[[place]], inspection.recorded)
                 one = Repeats(*(field[0] for field in again))
             deviations[number] = one
     return deviations
@@ -126,17 +126,17 @@ def _differ(of: Repeats) -> bool:
 
 
 class _Rows(NamedTuple):
-    """Some of the recordings of a group, with the same bands.
+    """Some of the recordings of an inspection, with the same bands.
 
     Attributes:
-        group: The group.
+        inspection: The inspection.
         rows: The recordings.
         at: Start of each of their periods [samples].
         aliased: Whether their aliases are known.
         layout: The bands.
     """
 
-    group: Group
+    inspection: Inspection
     rows: Int[np.ndarray, " lane"]
     at: Float[np.ndarray, "lane period"]
     aliased: Bool[np.ndarray, " lane"]
@@ -146,7 +146,7 @@ class _Rows(NamedTuple):
         self, values: Float[np.ndarray, "recording harmonic"]
     ) -> Float[np.ndarray, "lane band"]:
         """Values at the harmonics of each recording, at the centre of each band."""
-        frequency, rate = self.group.spectra[0], self.group.sample_rate
+        frequency, rate = self.inspection.spectrum[0], self.inspection.sample_rate
         angle = frequency[: values.shape[1]] * (2 * np.pi / rate)
         place = np.interp(self.layout.middle, angle, np.arange(angle.size))
         below = np.minimum(place.astype(int), angle.size - 2)
@@ -155,8 +155,8 @@ class _Rows(NamedTuple):
 
     def noise(self, record: int) -> Float[np.ndarray, "lane band"]:
         """Variance of the real part of a harmonic of one period, of one of the records."""
-        variance = self.in_bands(self.group.variance[:, record])
-        return variance * (self.group.periods[1] * self.layout.length / 2)
+        variance = self.in_bands(self.inspection.variance[:, record])
+        return variance * (self.inspection.periods[1] * self.layout.length / 2)
 
     def aliases(self) -> Bool[np.ndarray, "lane band"]:
         """Bands whose aliases may exceed the noise.
@@ -165,11 +165,11 @@ class _Rows(NamedTuple):
         the n harmonics of a band add up, noise does not.
         """
         high = np.repeat(self.layout.middle[None] > 2 * np.pi * ALIASES, self.rows.size, axis=0)
-        if self.group.has_current:
+        if self.inspection.has_current:
             return high
-        variance = self.group.variance[:, 1]
-        y = self.group.spectra[2][:, : variance.shape[1]]
-        ratio = np.asarray(aliases(y, variance, *self.group.periods).power / variance)
+        variance = self.inspection.variance[:, 1]
+        y = self.inspection.spectrum[2][:, : variance.shape[1]]
+        ratio = np.asarray(aliases(y, variance, *self.inspection.periods).power / variance)
         return high | (self.in_bands(ratio) * self.layout.number > 0.1)
 
     def deviations(
@@ -179,9 +179,9 @@ class _Rows(NamedTuple):
         late: Int[np.ndarray, " lane"],
     ) -> Deviations:
         """Deviations of the periods of one of the records, which may be late [samples]."""
-        group, count = self.group, self.layout.polynomials.shape[1]
-        if records is group.quiet:
-            found = group.cut(which).take(self.rows)
+        inspection, count = self.inspection, self.layout.polynomials.shape[1]
+        if records is inspection.quiet:
+            found = inspection.cut(which).take(self.rows)
         else:
             found = self._cut(records[self.rows, which], self.at)
         raw = found.each[..., 1 : count + 1].astype(np.complex64)
@@ -189,7 +189,7 @@ class _Rows(NamedTuple):
         for lane in np.flatnonzero(late):
             # Else a late record would be cut within its pulses. The samples cut off at one end are
             # added at the other.
-            v = np.roll(records[self.rows[lane], which, : group.periods[1]], -late[lane])
+            v = np.roll(records[self.rows[lane], which, : inspection.periods[1]], -late[lane])
             own = self._cut(v[None], self.at[[lane]])
             raw[lane], after[lane] = own.each[0, :, 1 : count + 1], own.starts[0] - self.at[lane]
         return deviations_of(raw, after, self.layout, self.noise(which), self.aliased)
@@ -197,20 +197,26 @@ class _Rows(NamedTuple):
     def _cut(
         self, v: Float[np.ndarray, "lane time"], at: Float[np.ndarray, "lane period"]
     ) -> Periods:
-        return Periods.of(v, at, self.group.sample_rate / self.group.pulse_rate)
+        return Periods.of(v, at, self.inspection.sample_rate / self.inspection.pulse_rate)
 
 
 def _of_rows(
-    group: Group,
+    inspection: Inspection,
     rows: Int[np.ndarray, " lane"],
     late: Int[np.ndarray, " lane"],
     records: Float[np.ndarray, "recording 2 time"],
 ) -> Repeats:
-    """Deviations of some recordings of a group, from these voltages; `v_out` may be late."""
-    rates = group.sample_rate, group.pulse_rate
-    of = _Rows(group, rows, group.begins[rows], group.differing.rows[rows], bands(*rates, 0.4))
+    """Deviations of some recordings of an inspection, from these voltages; `v_out` may be late."""
+    rates = inspection.sample_rate, inspection.pulse_rate
+    of = _Rows(
+        inspection,
+        rows,
+        inspection.begins[rows],
+        inspection.differing.rows[rows],
+        bands(*rates, 0.4),
+    )
     own = of.deviations(records, 1, late)
-    if group.has_current:
+    if inspection.has_current:
         return _of_currents(of, own, of.deviations(records, 0, 0 * late))
     # Of V_th only the amplitude is wanted. If some of the samples were left out, the aliases of its
     # edges would look like another amplitude in each period: by 1e-3 if every fourth remains.
@@ -224,10 +230,10 @@ def _of_rows(
     amplitude = along / total[:, None]
     # Coloured noise does not look like an amplitude change: the rest measures its size.
     rest = unloaded.gain - amplitude[:, :, None] * unit[:, None, :]
-    periods = group.periods[0]
+    periods = inspection.periods[0]
     freedom = (2 * low.layout.middle.size - 1) * (periods - 1)
     noise = np.maximum(1.0, (weight[:, None, :] * power_of(rest)).sum((1, 2)) / freedom)
-    width = _phases(records[rows, 0], group.limits[rows, 0]) / periods
+    width = _phases(records[rows, 0], inspection.limits[rows, 0]) / periods
     # Because cuts fall between samples, the amplitude differs by 1e-4 for 133 samples of a pulse,
     # by 0.03 for 8 samples.
     variance = noise / total + (2 / np.square(width)) ** 2
@@ -248,8 +254,8 @@ def _directions(
     removed[:, :, 0, 0] = of.aliases() & np.any(basis, axis=(1, 2), keepdims=True)[:, 0]
     if known.any():
         place = layout.middle / (2 * np.pi)
-        y = of.group.differing.of_out.take(of.rows[known]).at(place)[:, :2]
-        noise = of.in_bands(of.group.variance[:, 1])[known]
+        y = of.inspection.differing.of_out.take(of.rows[known]).at(place)[:, :2]
+        noise = of.in_bands(of.inspection.variance[:, 1])[known]
         ratio = np.repeat(y * layout.number / (late.shape[1] * noise)[:, None], 2, axis=1)
         inside = basis[known].conj().swapaxes(1, 2) @ turns[known]
         of_aliases = np.einsum("rak,rkb,rck->rbac", inside, ratio, inside.conj())
@@ -296,7 +302,7 @@ def _joined(
 ) -> Repeats:
     """The result, with the directions of the aliases."""
     turn, removed = _directions(of, own.late)
-    count, rate = len(of.rows), of.group.sample_rate
+    count, rate = len(of.rows), of.inspection.sample_rate
     frequency = np.repeat(of.layout.middle[None] * (rate / (2 * np.pi)), count, axis=0)
     parts = own.gain, own.power, smooth, own.variance, turn, removed
     return Repeats(frequency, np.full(count, rate), *parts, unloaded, unloaded_variance)

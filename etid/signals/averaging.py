@@ -308,3 +308,33 @@ def weighted(
     by = np.array([np.interp(place, PLACES, one) for one in of.T]) * (periods / samples)
     late = np.arange(periods) * (spacing - samples / periods)
     return np.einsum("...pk,pk->...k", each, by * np.exp(2j * np.pi * np.outer(late, place)))
+
+
+def without_aliases(
+    v: Float[np.ndarray, "record 2 time"],
+    coefficients: Complex[np.ndarray, "record 2 harmonic"],
+    power: Float[np.ndarray, "record 2 harmonic"],
+    differing: Differing,
+    periods: int,
+    samples: int,
+) -> tuple[Complex[np.ndarray, "record 2 harmonic"], Float[np.ndarray, "record 2 harmonic"]]:
+    """Harmonics and the power of their noise, of weighted means where aliases differ.
+
+    Args:
+        v: Samples of both records.
+        coefficients: `harmonics` of both records.
+        power: Power of their noise.
+        differing: The aliases that differ between the periods.
+        periods: Number of periods.
+        samples: Number of their samples.
+    """
+    coefficients, power = coefficients.copy(), power.copy()
+    place = np.arange(1.0, power.shape[-1] + 1) * (periods / samples)
+    for row in np.flatnonzero(differing.rows):
+        spacing = differing.spacing[row]
+        both = differing.of_cause.take(row), differing.of_out.take(row)
+        of = weights(spacing, periods, np.interp(PLACES, place, power[row, 0]), both[0])
+        coefficients[row] = weighted(v[row, :, :samples], spacing, of)
+        power[row] *= np.interp(place, PLACES, periods * np.square(of).sum(-1))
+        power[row] += [np.interp(place, PLACES, left(of, spacing, one)) for one in both]
+    return coefficients, power

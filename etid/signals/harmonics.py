@@ -27,6 +27,7 @@ of the variance n |A|². This variance adds to that of the noise.
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -256,7 +257,9 @@ class Aliases(NamedTuple):
         """Variance of independent errors that stand for A [V²]."""
         return self.harmonics * self.power
 
-    def are_unknown(self, variance: Float[np.ndarray, " harmonic"]) -> bool:
+    def are_unknown(
+        self, variance: Float[np.ndarray, "*record harmonic"]
+    ) -> Bool[np.ndarray, "*record"]:
         """Whether A exceeds noise of this variance, and its size does not follow from the record.
 
         A is compared at the highest harmonic of a fit, where it is largest. A spectrum may be
@@ -267,7 +270,7 @@ class Aliases(NamedTuple):
         where nothing is measured.
         """
         last = int(ALIASED * self.harmonics / COHERENT) - 1
-        return bool(self.variance[last] > variance[last] and self.fall < 11.0)
+        return np.asarray((self.variance[..., last] > variance[..., last]) & (self.fall < 11.0))
 
 
 def aliases(
@@ -300,11 +303,11 @@ def aliases(
 
 
 def have_ended(
-    coefficients: tuple[Complex[np.ndarray, " harmonic"], Complex[np.ndarray, " harmonic"]],
-    variances: tuple[Float[np.ndarray, " harmonic"], Float[np.ndarray, " harmonic"]],
+    coefficients: Sequence[Complex[np.ndarray, "record harmonic"]],
+    variances: Sequence[Float[np.ndarray, "record harmonic"]],
     periods: int,
     samples: int,
-) -> bool:
+) -> Bool[np.ndarray, " record"]:
     """Whether both records surely end below half the sample rate, so that they have no aliases.
 
     From one of the octaves, the spectrum of the cause falls so far that what noise may hide beyond,
@@ -313,16 +316,17 @@ def have_ended(
     all harmonics. The estimate of the noise has two standard errors of these, so that eight of them
     are allowed.
     """
-    position = np.arange(1.0, variances[0].size + 1) * (periods / samples)
+    position = np.arange(1.0, variances[0].shape[1] + 1) * (periods / samples)
     beyond = (position >= BEYOND[0]) & (position < BEYOND[1])
+    falls = np.zeros(len(variances[0]), bool)
     if not beyond.any():
-        return False
+        return falls
     excess = [np.square(np.abs(c)) - v for c, v in zip(coefficients, variances, strict=True)]
-    errors = [v[beyond].mean() / math.sqrt(np.count_nonzero(beyond)) for v in variances]
-    of_cause = max(excess[0][beyond].mean(), 0.0) + 3 * errors[0]
-    falls = False
+    errors = [v[:, beyond].mean(1) / math.sqrt(np.count_nonzero(beyond)) for v in variances]
+    of_cause = np.maximum(excess[0][:, beyond].mean(1), 0.0) + 3 * errors[0]
     for low in OCTAVES:
         inside = (position >= low) & (position < 2 * low)
-        level = of_cause * (sum(BEYOND) / (3 * low)) ** END
-        falls |= inside.any() and excess[0][inside].mean() > level
-    return bool(falls and excess[1][beyond].mean() < 8 * errors[1])
+        if inside.any():
+            level = of_cause * (sum(BEYOND) / (3 * low)) ** END
+            falls |= excess[0][:, inside].mean(1) > level
+    return falls & (excess[1][:, beyond].mean(1) < 8 * errors[1])

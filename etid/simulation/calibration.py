@@ -170,10 +170,10 @@ def calibrate(
     """
     records = [calibrations] if isinstance(calibrations, Recording) else list(calibrations)
     driver = identify_driver(records, order=order)
-    noise = [float(Inspected(one).sigma[1]) for one in records]
+    noise = [float(Inspected.of(one).sigma[1]) for one in records]
     r = _further(driver, [one.r_load or 0.0 for one in records])
     known = CheckedCalibration(driver, noise, {})
-    if all(Inspected(one).whole_periods[0] for one in records):
+    if all(Inspected.of(one).whole_periods[0] for one in records):
         assert isinstance(driver, ContinuousDriver)  # as the default methods make it
         feed = driver if isinstance(driver, HarmonicDriver) else with_harmonics(driver, records)
         ways = {NOW: (None, 1.0), MORE: (None, LONGER), f"also with {r / 1e3:g} kΩ": (r, 1.0)}
@@ -317,7 +317,7 @@ def calibrations_in(paths: Sequence[str | os.PathLike[str]]) -> list[Recording]:
 
 def imitated(recording: Recording, driver: Driver, skin: SkinRC) -> Recording:
     """The recording as it would be with skin: whole periods, with noise of its own."""
-    seen = Inspected(recording)
+    seen = Inspected.of(recording)
     _, size = seen.whole_periods
     f = jax.device_put(np.fft.rfftfreq(size, 1 / recording.sample_rate)[1:])
     z, z_th = np.asarray(skin.response(f)), np.asarray(driver.response(f))

@@ -1,4 +1,4 @@
-"""Recordings of equal length and equal rates, inspected together."""
+"""What is found in recordings of equal length and equal rates before a fit."""
 
 import functools
 import math
@@ -11,23 +11,21 @@ from jaxtyping import Bool, Float, Int
 from etid.recordings import faults
 from etid.recordings.faults import covariance_of
 from etid.recordings.recording import Recording, Samples, quietly
-from etid.signals.averaging import (
-    PLACES,
-    Differing,
-    differing_aliases,
-    left,
-    weighted,
-    weights,
-)
+from etid.recordings.remarks import Remark
+from etid.signals.averaging import Differing, differing_aliases, exact_spacing, without_aliases
 from etid.signals.disturbances import Joint, Shifts, disturbed, kept
 from etid.signals.drift import clocks_apart, largest_drift
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import (
+    ALIASED,
+    aliases,
     filled,
     harmonics,
+    have_ended,
+    joins_aliases,
     whole_periods,
 )
-from etid.signals.lags import lags_of
+from etid.signals.lags import lags_of, whole_lag
 from etid.signals.mains import Hum, separated
 from etid.signals.noise import Noise, floor, noise_of
 from etid.signals.periods import Periods
@@ -41,15 +39,15 @@ _Holds = Bool[np.ndarray, " row"]
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 
 
-class Group:
-    """Recordings of equal length and rates that hold equal numbers of periods, inspected together.
+class Inspection:
+    """What is found in recordings before a fit; they have equal lengths, rates, and periods.
 
-    Each property has one entry for each recording and is computed once, when it is used. An axis of
+    Each property has one row for each recording and is computed once, when it is used. An axis of
     length 2 holds `v_th` and `v_out`. In recordings of a measured current, the current is in the
     place of `v_th`, here and below, and its unit is the ampere.
 
     Args:
-        recordings: The recordings; `together` puts them into groups.
+        recordings: The recordings; `together` finds those that are alike.
     """
 
     def __init__(self, recordings: Sequence[Recording]) -> None:
@@ -62,38 +60,43 @@ class Group:
 
     @functools.cached_property
     @quietly()
-    def whole(self) -> Float[np.ndarray, "recording 2 time"]:
+    def recorded(self) -> Float[np.ndarray, "recording 2 time"]:
         """Voltages of all periods as they were recorded [V]."""
         size = self.recordings[0].samples["v_out"].stored.size
-        whole = np.empty((len(self.recordings), 2, size))
-        for records, one in zip(whole, self.recordings, strict=True):
+        recorded = np.empty((len(self.recordings), 2, size))
+        for records, one in zip(recorded, self.recordings, strict=True):
             for v, record in zip(records, _records(one), strict=True):
                 record.write_to(v)
-        whole.flags.writeable = False
-        return whole
+        recorded.flags.writeable = False
+        return recorded
 
-    def part(self, rows: Sequence[int]) -> "Group":
+    def part(self, rows: Sequence[int]) -> "Inspection":
         """Some of the recordings."""
-        part = Group([self.recordings[row] for row in rows])
-        vars(part).update(whole=self.whole[rows], trains=[self.trains[row] for row in rows])
+        part = Inspection([self.recordings[row] for row in rows])
+        vars(part).update(recorded=self.recorded[rows], train=[self.train[row] for row in rows])
         return part
 
-    def joined(self, row: int, plan: Joint) -> "Group":
-        """One of the recordings with the periods of a plan, as a group of its own."""
+    def in_use(self, row: int) -> tuple["Inspection", int]:
+        """An inspection of the periods of a recording that are in use, and its row there."""
+        plan, shifts = self._periods[row]
+        if plan is None:
+            return self, row
         joined = self.part([row])
-        whole = plan(self.whole[row])[None]
-        quiet = whole if self.quiet is self.whole else plan(self.quiet[row])[None]
+        recorded = plan(self.recorded[row])[None]
+        quiet = recorded if self.quiet is self.recorded else plan(self.quiet[row])[None]
         vars(joined).update(
-            whole=whole,
+            recorded=recorded,
             quiet=quiet,
-            periods=(plan.first.size, whole.shape[2]),
+            whole_periods=self.whole_periods,
+            periods=(plan.first.size, recorded.shape[2]),
             begins=plan.begins[None],
             coarse=self.coarse[[row]],
+            hum=[self.hum[row]],
             apart=self.apart[[row]],
-            _periods=[(None, None)],
+            _periods=[(plan, shifts)],
             _cut=1.0,  # each period begins at a whole sample
         )
-        return joined
+        return joined, 0
 
     @functools.cached_property
     def step(self) -> Float[np.ndarray, "recording 2"]:
@@ -102,27 +105,27 @@ class Group:
 
     @functools.cached_property
     @quietly()
-    def noise(self) -> Float[np.ndarray, "recording 2"]:
-        """Standard deviations of the noise of a sample of `whole` [V]; see `Noise.std`."""
+    def sigma(self) -> Float[np.ndarray, "recording 2"]:
+        """Standard deviations of the noise of a sample of `recorded` [V]; see `Noise.std`."""
         of, samples = self._of_whole, self._shown[1]
         if self.mismatch and self.periods[0]:
-            samples = self.whole.shape[2]
-            of = noise_of(self.whole, 1, samples)
+            samples = self.recorded.shape[2]
+            of = noise_of(self.recorded, 1, samples)
         return np.maximum(of.std(samples), self.step / math.sqrt(12.0))
 
     @property
     def _shown(self) -> tuple[int, int]:
         """`periods`; less than a period is taken for one."""
-        return self.periods if self.periods[0] else (1, self.whole.shape[2])
+        return self.periods if self.periods[0] else (1, self.recorded.shape[2])
 
     @functools.cached_property
     def _of_whole(self) -> Noise:
-        """The noise of `whole` at each harmonic."""
-        return self._noise(self.whole)
+        """The noise of `recorded` at each harmonic."""
+        return self._noise(self.recorded)
 
     def _noise(self, records: Float[np.ndarray, "recording 2 time"]) -> Noise:
         periods, samples = self._shown
-        rest = periods * self.counted_spacing - samples
+        rest = periods * self.spacing - samples
         return noise_of(records, periods, samples, np.repeat(rest[:, None], 2, axis=1))
 
     @functools.cached_property
@@ -131,50 +134,67 @@ class Group:
         """Converter steps [V] that exceed the noise, else 0."""
         found = np.zeros(self.step.shape)
         spans = np.ptp(self.recorded_limits, axis=-1)
-        visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.whole))
+        visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.recorded))
         for row, which in np.argwhere(visible):
-            v = self.whole[row, which]
+            v = self.recorded[row, which]
             step = float(self.step[row, which]) or step_of(v)
             found[row, which] = step if is_coarse(v, step) else 0.0
         return found
 
     @functools.cached_property
-    def trains(self) -> list[PulseTrain]:
+    def train(self) -> list[PulseTrain]:
         """Pulse trains of `v_th`."""
-        return pulse_trains(self.whole[:, 0], self.sample_rate, self.pulse_rate)
+        return pulse_trains(self.recorded[:, 0], self.sample_rate, self.pulse_rate)
 
     @property
     def mismatch(self) -> bool:
         """Whether the pulses contradict the rates."""
-        return self.trains[0].mismatch != ""
+        return self.train[0].mismatch != ""
 
     @functools.cached_property
-    def counted_spacing(self) -> Float[np.ndarray, " recording"]:
+    def counted(self) -> Float[np.ndarray, " recording"]:
+        """Pulse rates [Hz], measured with the clocks of the recordings."""
+        return np.array([train.counted for train in self.train])
+
+    @functools.cached_property
+    def spacing(self) -> Float[np.ndarray, " recording"]:
         """Length of a pulse period, from the measured pulse rate [samples]."""
-        return self.sample_rate / np.array([train.counted for train in self.trains])
+        return self.sample_rate / self.counted
+
+    @functools.cached_property
+    def whole_periods(self) -> tuple[int, int]:
+        """Number of whole periods of each recording, and their number of samples."""
+        return whole_periods(self.recorded.shape[2], self.sample_rate, self.train[0].counted)
 
     @functools.cached_property
     def periods(self) -> tuple[int, int]:
-        """Number of whole periods in each recording, and their number of samples."""
-        return whole_periods(self.whole.shape[2], self.sample_rate, self.trains[0].counted)
+        """The same of the periods in use."""
+        return self.whole_periods
 
     @functools.cached_property
     @quietly()
     def hum(self) -> list[list[Hum | None]]:
         """Hum that is subtracted from each record; None if there is none."""
         found: list[list[Hum | None]] = [[None, None] for _ in self.recordings]
-        suspect = humming(self.whole, self.noise, self.sample_rate, self.pulse_rate, *self.periods)
+        suspect = humming(
+            self.recorded, self.sigma, self.sample_rate, self.pulse_rate, *self.periods
+        )
         for row, which in np.argwhere(suspect):
-            known = self.whole[row, which], float(self.noise[row, which]), self.sample_rate
+            known = self.recorded[row, which], float(self.sigma[row, which]), self.sample_rate
             found[row][which] = separated(*known, *self.periods)
         return found
 
     @functools.cached_property
+    def hums(self) -> Bool[np.ndarray, " recording"]:
+        """Whether hum is subtracted from one of the records."""
+        return np.array([any(hum is not None for hum in both) for both in self.hum])
+
+    @functools.cached_property
     def quiet(self) -> Float[np.ndarray, "recording 2 time"]:
         """Voltages of all periods without hum between the harmonics [V]."""
-        if all(hum is None for both in self.hum for hum in both):
-            return self.whole
-        quiet = self.whole.copy()
+        if not self.hums.any():
+            return self.recorded
+        quiet = self.recorded.copy()
         for records, both in zip(quiet, self.hum, strict=True):
             for v, hum in zip(records, both, strict=True):
                 if hum is not None:
@@ -183,13 +203,13 @@ class Group:
 
     @functools.cached_property
     def recorded_limits(self) -> Float[np.ndarray, "recording 2 limit"]:
-        """Smallest and largest sample of each record in `whole` [V]."""
-        return _limits(self.whole)
+        """Smallest and largest sample of each record in `recorded` [V]."""
+        return _limits(self.recorded)
 
     @functools.cached_property
     def limits(self) -> Float[np.ndarray, "recording 2 limit"]:
         """Smallest and largest sample of each record in `quiet` [V]."""
-        return self.recorded_limits if self.quiet is self.whole else _limits(self.quiet)
+        return self.recorded_limits if self.quiet is self.recorded else _limits(self.quiet)
 
     @functools.cached_property
     def covariance(self) -> Float[np.ndarray, "recording 2 2"]:
@@ -214,8 +234,8 @@ class Group:
         if self.mismatch:
             return found
         periods = self.periods[0]
-        for spacing, rows in _alike(self.counted_spacing.tolist()).items():
-            of = _part(self.quiet, rows), self.noise[rows], self.coarse[rows]
+        for spacing, rows in _alike(self.spacing.tolist()).items():
+            of = _part(self.quiet, rows), self.sigma[rows], self.coarse[rows]
             for row in np.flatnonzero(uneven(*of, spacing, periods)):
                 records, sigma, step = (part[[row]] for part in of)
                 (bad,) = disturbed(records, sigma, step, spacing, periods)
@@ -224,39 +244,46 @@ class Group:
 
     @functools.cached_property
     @quietly()
-    def lags(self) -> Float[np.ndarray, " recording"]:
+    def correlated(self) -> Float[np.ndarray, " recording"]:
         """Lags of `v_out` in `quiet` [samples]; NaN if misaligned or if the rates are wrong."""
         if self.mismatch:
             return np.full(len(self.recordings), np.nan)
-        return lags_of(self.quiet, self.trains)
+        return lags_of(self.quiet, self.train)
+
+    @functools.cached_property
+    def lag(self) -> Int[np.ndarray, " recording"]:
+        """Lags of `v_out` to be removed before a fit [whole samples]; 0 where none is known.
+
+        They are 0 for a measured current: one instrument records both, and the voltage at a
+        capacitor shows no edge where the current has one.
+        """
+        known = np.isfinite(self.correlated) & (not self.has_current)
+        late = zip(self.correlated.tolist(), known.tolist(), strict=True)
+        return np.array([whole_lag(lag) if holds else 0 for lag, holds in late])
 
     @functools.cached_property
     def trusted(self) -> Float[np.ndarray, "recording 2"]:
-        """`noise` as far as estimators trust it: not below the error of the interpolation."""
-        return np.maximum(self.noise, floor(self.limits, self.step))
+        """`sigma` as far as estimators trust it: not below the error of the interpolation."""
+        return np.maximum(self.sigma, floor(self.limits, self.step))
 
     @functools.cached_property
     @quietly()
     def apart(self) -> Float[np.ndarray, " recording"]:
         """Drift of `v_out` against its cause from the first pulse to the last [samples]."""
-        return clocks_apart(self.quiet, self.noise, self.trains, self.lags)
+        return clocks_apart(self.quiet, self.sigma, self.train, self.correlated)
 
     @functools.cached_property
     @quietly()
-    def periodic(self) -> Bool[np.ndarray, " recording"]:
-        """`faults.is_periodic` of each recording in `quiet`, with all its periods."""
-        periods, samples = self.periods
-        if periods == 0:
+    def is_periodic(self) -> Bool[np.ndarray, " recording"]:
+        """Whether each recording holds whole periods, without a step from its end to its start.
+
+        If periods are left out, each begins at a whole sample, up to one sample from its place.
+        """
+        if self.periods[0] == 0:
             return np.zeros(len(self.recordings), bool)
-        rest = np.maximum(np.abs(periods * self.counted_spacing - samples), self._cut)
-        found = faults.is_periodic(self.quiet, self.trusted, rest, samples)
-        on_edge = ~faults.is_periodic(self.quiet, self.trusted, np.ones(rest.size), samples)
-        # Jitter of the last pulse looks like another pulse rate.
-        on_edge &= found & (self.counted_spacing != self.sample_rate / self.pulse_rate)
-        for row in np.flatnonzero(on_edge):
-            of = self.quiet[row], self.trusted[row], float(self.counted_spacing[row])
-            found[row] = faults.begins_again(*of, samples)
-        return found
+        period = self.sample_rate / self.pulse_rate
+        of = self.quiet, self.trusted, self.spacing
+        return faults.is_periodic(*of, *self.periods, self._cut, self.spacing != period)
 
     @functools.cached_property
     @quietly()
@@ -265,9 +292,9 @@ class Group:
         return self.limits[..., 1] - self.limits[..., 0]
 
     @functools.cached_property
-    def flat(self) -> Bool[np.ndarray, "recording 2"]:
+    def is_flat(self) -> Bool[np.ndarray, "recording 2"]:
         """Whether `v_th` and `v_out` carry no signal."""
-        return faults.flat(self.spans, self.covariance, self.noise)
+        return faults.flat(self.spans, self.covariance, self.sigma)
 
     @functools.cached_property
     def clocks_differ(self) -> Bool[np.ndarray, " recording"]:
@@ -295,22 +322,22 @@ class Group:
 
     @functools.cached_property
     @quietly()
-    def noise_of_quiet(self) -> Noise:
+    def noise(self) -> Noise:
         """The noise of `quiet`: at least the rounding and the error of the interpolation."""
-        noise = self._of_whole if self.quiet is self.whole else self._noise(self.quiet)
+        noise = self._of_whole if self.quiet is self.recorded else self._noise(self.quiet)
         least = floor(self.limits, self.step)[..., None] ** 2 / self._shown[1]
         return noise._replace(power=np.maximum(noise.power, least))
 
     @functools.cached_property
     def variance(self) -> Float[np.ndarray, "recording 2 harmonic"]:
-        """`Noise.variance` of `noise_of_quiet`."""
-        return np.asarray(self.noise_of_quiet.variance)
+        """`Noise.variance` of `noise`."""
+        return np.asarray(self.noise.variance)
 
     @quietly()
     def cut(self, which: int) -> Periods:
         """The periods of `v_th` or of `v_out` in `quiet`, cut where the counted rate says."""
         if which not in self._cuts:
-            at = self.counted_spacing[:, None] * np.arange(self.periods[0])
+            at = self.spacing[:, None] * np.arange(self.periods[0])
             period = self.sample_rate / self.pulse_rate
             self._cuts[which] = Periods.of(self.quiet[:, which], at, period)
         return self._cuts[which]
@@ -322,12 +349,12 @@ class Group:
             return np.zeros(len(self.recordings), bool)
         middle = self.periods[1] // self.periods[0]
         at = np.abs(self.quiet[:, :, middle] - self.quiet.mean(-1))
-        trained = [train.spacing is not None for train in self.trains]
+        trained = [train.spacing is not None for train in self.train]
         return np.array(trained) & (at < 0.1 * np.ptp(self.limits, axis=-1)).all(-1)
 
     @property
-    def spectra(self) -> tuple[np.ndarray, ...]:
-        """`etid.signals.harmonics.filled` of `quiet`."""
+    def spectrum(self) -> tuple[np.ndarray, ...]:
+        """`etid.signals.harmonics.filled` of `quiet`: frequencies, and fields with rows."""
         return self._spectra[0]
 
     @property
@@ -343,93 +370,137 @@ class Group:
     @functools.cached_property
     @quietly()
     def _spectra(self) -> tuple[tuple[np.ndarray, ...], Differing]:
-        periods, samples = self.periods
-        found = np.asarray(harmonics(self.quiet, periods, samples))
-        noise = self.noise_of_quiet
-        power = self.variance.copy()
-        differing = differing_aliases(
-            found, power, self.periods, self.counted_spacing, self._rests, self.cut
-        )
-        place = np.arange(1.0, power.shape[-1] + 1) * (periods / samples)
-        for row in np.flatnonzero(differing.rows):
-            both, spacing = (
-                (differing.of_cause.take(row), differing.of_out.take(row)),
-                differing.spacing[row],
-            )
-            of = weights(spacing, periods, np.interp(PLACES, place, power[row, 0]), both[0])
-            found[row] = weighted(self.quiet[row, :, :samples], spacing, of)
-            power[row] *= np.interp(place, PLACES, periods * np.square(of).sum(-1))
-            power[row] += [np.interp(place, PLACES, left(of, spacing, one)) for one in both]
-        *fields, selected = filled(found, power, self.sample_rate, periods, samples)
+        found, noise = np.asarray(harmonics(self.quiet, *self.periods)), self.noise
+        of = self.variance, self.periods, self.spacing
+        differing = differing_aliases(found, *of, self._rests, self.cut)
+        found, power = without_aliases(self.quiet, found, self.variance, differing, *self.periods)
+        *fields, selected = filled(found, power, self.sample_rate, *self.periods)
         usable = np.repeat(selected[None], len(self.recordings), axis=0)
         of_ends = np.asarray(noise.of_ends).any(axis=1)
         coarse = np.any(self.coarse, axis=1, keepdims=True)  # its quiet parts say little
         usable[:, : power.shape[-1]] &= coarse | ~of_ends
         return (*map(np.asarray, fields), usable), differing
 
+    @functools.cached_property
+    def exact_spacing(self) -> Float[np.ndarray, " recording"]:
+        """`spacing`, or the length that the phases of the pulses in use surely have [samples]."""
+        exact = self.spacing.copy()
+        trained = np.flatnonzero([train.spacing is not None for train in self.train])
+        if trained.size and self.periods[0] > 1:
+            exact[trained] = exact_spacing(self.cut(0).take(trained), exact[trained])
+        return exact
 
-def together(recordings: Sequence[Recording]) -> list[tuple[Group, list[int]]]:
-    """Groups of recordings with equal lengths and rates, and the places of their recordings."""
-    every = Group(recordings)
-    size, rate = every.whole.shape[2], every.sample_rate
-    keys = [(one.mismatch != "", whole_periods(size, rate, one.counted)) for one in every.trains]
+    @functools.cached_property
+    def covered(self) -> Bool[np.ndarray, "recording harmonic"]:
+        """Whether each harmonic of `spectrum` is unusable because of hum or aliases.
+
+        Hum covers a harmonic if the subtraction does not remove it there. Aliases cover the high
+        harmonics of records with two periods or with periods left out. They are half as large as
+        the aliases of a single period.
+        """
+        frequency, periods = self.spectrum[0], self.whole_periods[0]
+        aliased = np.array([kept is not None for kept in self.kept]) | (self.periods[0] == 2)
+        covered = aliased[:, None] & (frequency > ALIASED * self.sample_rate)
+        for row in np.flatnonzero(self.hums):
+            for hum in filter(None, self.hum[row]):
+                covered[row] |= hum.covers(frequency, periods)
+        return covered
+
+    @functools.cached_property
+    @quietly()
+    def has_no_aliases(self) -> Bool[np.ndarray, " recording"]:
+        """Whether the spectra of a current and of `v_out` surely end below half the sample rate."""
+        if not self.has_current:
+            return np.zeros(len(self.recordings), bool)
+        _, x, y, variance_x, variance_y, _ = self.spectrum
+        return have_ended((x, y), (variance_x, variance_y), *self.periods)
+
+    @functools.cached_property
+    @quietly()
+    def is_aliased(self) -> Bool[np.ndarray, " recording"]:
+        """Whether aliases of unknown size fall on the harmonics of `v_th`, above its noise."""
+        if not joins_aliases(*self.periods):
+            return np.zeros(len(self.recordings), bool)
+        _, x, _, variance, *_ = self.spectrum
+        unknown = aliases(x, variance, *self.periods).are_unknown(variance)
+        return unknown & ~self.has_no_aliases
+
+    @functools.cached_property
+    def remarks(self) -> Int[np.ndarray, " recording"]:
+        """Remarks on how recordings are changed before a fit, but for `Remark.aligned`."""
+        found = {
+            Remark.mains_hum: self.hums,
+            Remark.periods_left_out: self.periods[0] < self.whole_periods[0],
+            Remark.periods_shifted: np.array([shifts is not None for shifts in self.shifts]),
+            Remark.coarse_converter: self.coarse.any(1),
+            # A clock is not more than 300 ppm wrong.
+            Remark.pulse_rate_counted: np.abs(self.counted / self.pulse_rate - 1) > 3e-4,
+        }
+        return np.asarray(sum(int(remark) * holds for remark, holds in found.items()))
+
+
+def together(recordings: Sequence[Recording]) -> list[tuple[Inspection, list[int]]]:
+    """Inspections of recordings of equal lengths and rates, and the places of their rows."""
+    every = Inspection(recordings)
+    size, rate = every.recorded.shape[2], every.sample_rate
+    keys = [(one.mismatch != "", whole_periods(size, rate, one.counted)) for one in every.train]
     alike = list(_alike(keys).values())
     return [(every if len(alike) == 1 else every.part(rows), rows) for rows in alike]
 
 
-def _too_short(group: Group, rows: _Rows) -> _Holds:
-    shortest = max(SHORTEST, rise_time(group.sample_rate) + 1)
-    return np.full(rows.size, group.whole.shape[2] < shortest)
+def _too_short(seen: Inspection, rows: _Rows) -> _Holds:
+    shortest = max(SHORTEST, rise_time(seen.sample_rate) + 1)
+    return np.full(rows.size, seen.recorded.shape[2] < shortest)
 
 
-def _saturated(group: Group, rows: _Rows) -> _Holds:
+def _saturated(seen: Inspection, rows: _Rows) -> _Holds:
     nothing = math.nan, math.nan
-    ranges = [group.recordings[row].adc_range or nothing for row in rows]
+    ranges = [seen.recordings[row].adc_range or nothing for row in rows]
     adc_range = np.repeat(np.array(ranges)[:, None], 2, axis=1)
-    if group.has_current:
+    if seen.has_current:
         adc_range[:, 0] = nothing  # it is one of volts
-    records, limits = _part(group.whole, rows), group.recorded_limits[rows]
-    sigma, step = group.noise[rows], group.step[rows]
+    records, limits = _part(seen.recorded, rows), seen.recorded_limits[rows]
+    sigma, step = seen.sigma[rows], seen.step[rows]
     found = faults.saturated(records, limits, step, adc_range)
-    if group.has_current:
-        found[:, 0] &= ~faults.held(sigma[:, 0], step[:, 0], group.spans[rows, 0])
+    if seen.has_current:
+        found[:, 0] &= ~faults.held(sigma[:, 0], step[:, 0], seen.spans[rows, 0])
         return np.asarray(found.any(1))  # a stimulator that holds its voltage is no fault
-    unit = np.maximum(np.maximum(sigma, step), group.coarse[rows])[:, 1]
-    of = limits[:, 1], unit, group.lags[rows], group.sample_rate
+    unit = np.maximum(np.maximum(sigma, step), seen.coarse[rows])[:, 1]
+    of = limits[:, 1], unit, seen.correlated[rows], seen.sample_rate
     return found.any(1) | faults.limited(records, *of)
 
 
-def _implausible(group: Group, rows: _Rows) -> _Holds:
-    found = [group.has_current and not faults.is_plausible(*group.spans[row, ::-1]) for row in rows]
+def _implausible(seen: Inspection, rows: _Rows) -> _Holds:
+    found = [seen.has_current and not faults.is_plausible(*seen.spans[row, ::-1]) for row in rows]
     return np.array(found, bool)
 
 
-def _unconnected(group: Group, rows: _Rows) -> _Holds:
-    if group.has_current:
+def _unconnected(seen: Inspection, rows: _Rows) -> _Holds:
+    if seen.has_current:
         return np.zeros(rows.size, bool)
-    of = group.covariance[rows], group.noise[rows], group.lags[rows]
-    return faults.unconnected(_part(group.quiet, rows), *of)
+    of = seen.covariance[rows], seen.sigma[rows], seen.correlated[rows]
+    return faults.unconnected(_part(seen.quiet, rows), *of)
 
 
-def _misaligned(group: Group, rows: _Rows) -> _Holds:
-    hopeless = [kept is None and found is not None for kept, found in group._periods]
-    of_th, of_both, of_out = (group.covariance[rows, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+def _misaligned(seen: Inspection, rows: _Rows) -> _Holds:
+    hopeless = [kept is None and found is not None for kept, found in seen._periods]
+    of_th, of_both, of_out = (seen.covariance[rows, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     wrong = np.array(hopeless, bool)[rows]
-    if group.has_current:
+    if seen.has_current:
         return np.asarray(wrong | (of_both <= 0))  # a passive load takes power
-    return np.asarray(wrong | (of_out > 1.01 * of_th) | np.isnan(group.lags[rows]))
+    return np.asarray(wrong | (of_out > 1.01 * of_th) | np.isnan(seen.correlated[rows]))
 
 
 _VERDICTS = {
     "too_short": _too_short,
-    "nonfinite_samples": lambda group, rows: (
-        ~(np.isfinite(group.limits[rows]).all((1, 2)) & np.isfinite(group.spans[rows]).all(1))
+    "nonfinite_samples": lambda seen, rows: (
+        ~(np.isfinite(seen.limits[rows]).all((1, 2)) & np.isfinite(seen.spans[rows]).all(1))
     ),
-    "flat": lambda group, rows: group.flat[rows].any(1),
+    "flat": lambda seen, rows: seen.is_flat[rows].any(1),
     "saturated": _saturated,
     "wrong_unit": _implausible,
     "unconnected": _unconnected,
-    "rate_mismatch": lambda group, rows: group.mismatch | group.clocks_differ[rows],
+    "rate_mismatch": lambda seen, rows: seen.mismatch | seen.clocks_differ[rows],
     "misaligned": _misaligned,
 }
 
