@@ -22,9 +22,9 @@ from etid.estimators.judgement import (
     unless,
 )
 from etid.estimators.output_error.estimator import INTERPOLATED
+from etid.likelihood.linear import NormalEquations
 from etid.recordings.remarks import Remark
 from etid.results.verdicts import RESULTS, verdict
-from etid.solvers.levenberg_marquardt import NormalEquations
 
 
 def estimate(
@@ -143,7 +143,7 @@ def test_what_an_estimate_shows_beside_its_elements_are_remarks():
 def test_the_distance_to_the_minimum_is_in_standard_errors():
     """Of a parabola with its minimum at 0: at y the gradient is H y, and the square yᵀ H y."""
     matrix, y = np.array([[4.0, 1.0], [1.0, 9.0]]), np.array([0.5, -2.0])
-    equations = NormalEquations(*map(jnp.asarray, (0.5 * y @ matrix @ y, matrix @ y, matrix)))
+    equations = NormalEquations(0.5 * y @ matrix @ y, matrix @ y, matrix)
     np.testing.assert_allclose(distance_to_minimum(equations), y @ matrix @ y, rtol=1e-12)
 
 

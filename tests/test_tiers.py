@@ -186,9 +186,7 @@ def test_no_small_work_compiles_anything(tmp_path):
     assert not any(found.values()), found
 
 
-def test_a_fit_depends_neither_on_what_ran_before_nor_on_the_number_of_recordings(
-    studies, monkeypatch
-):
+def test_a_fit_depends_neither_on_what_ran_before_nor_on_the_number_of_recordings(studies):
     """And it keeps one thread busy: threads of BLAS that wait would take more time than the fit."""
     study = studies["dry", 60.0]
     calibration, recordings = study["calibration/98k8"], list(study.loaded.recordings())[:3]
@@ -202,11 +200,8 @@ def test_a_fit_depends_neither_on_what_ran_before_nor_on_the_number_of_recording
     again = etid.identify_skin(recordings[0], driver)
     for one, other in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(one, other)
-    monkeypatch.setattr(tiers, "WORTH_COMPILING", 0)
-    many = etid.identify_skins(recordings, driver)
-    np.testing.assert_array_equal(few.fit.verdict, many.fit.verdict)
-    np.testing.assert_allclose(few.fit.circuit.r_s, many.fit.circuit.r_s, rtol=1e-9)
-    np.testing.assert_allclose(few.fit.cov, many.fit.cov, rtol=1e-6)
+    np.testing.assert_allclose(few.fit.circuit.r_s[0], first.circuit.r_s, rtol=1e-9)
+    np.testing.assert_allclose(few.fit.cov[0], first.cov, rtol=1e-6)  # other orders of sums
 
 
 def scaled(x):

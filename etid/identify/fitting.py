@@ -1,8 +1,9 @@
 """The fit of a batch of recordings that share a driver: fitted, fitted again, judged.
 
-Recordings of one length share one compiled function. It takes up to `LANES` recordings, so that
-memory is bounded. A CPU fits them one after the other: side by side (`vmap`) they take twice the
-time, even with equal numbers of steps. Accelerators fit them side by side. NumPy fits few.
+NumPy fits rows of recordings (`estimator.rows`). For other estimators and on accelerators, the
+recordings of one length share one compiled function. It takes up to `LANES` recordings, so that
+memory is bounded. A processor fits them one after the other: side by side (`vmap`) they take twice
+the time, even with equal numbers of steps. Accelerators fit them side by side.
 
 A recording is fitted again if it is late, after a shift of its records, and if hum may explain what
 its fit misses, without the mains harmonics.
@@ -458,7 +459,7 @@ def fits_of(
     if ROWS and jax.default_backend() == "cpu" and estimator.rows:
         parts = estimator.fit_rows(lanes, *of[:-1])
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    if not worth_compiling(total, lanes[0].periodic):
+    if not worth_compiling(total):
         return stacked(jax.device_get([skin(lane, *of) for lane in lanes]))
     fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
     return taken(fits, np.arange(len(lanes)))  # without the padding

@@ -41,10 +41,9 @@ AT_ONCE = {
     "xla_cpu_prefer_vector_width": 128,
 }
 
-# XLA compiles a batch for 3 to 8 s, the longer the records are. NumPy takes 7 to 35 ms longer than
-# XLA for each fit of harmonics, however many there are, and ten times as long for a fit in time.
-WORTH_COMPILING = 400  # fits of harmonics
-WORTH_COMPILING_IN_TIME = 40  # fits of samples
+# Fits in time. XLA compiles a batch for 3 to 8 s, the longer the records are; NumPy takes ten times
+# as long for each fit.
+WORTH_COMPILING = 40
 
 PATIENCE = 1.0  # [s] waiting time without a word
 COMPILING = "etid: JAX compiles the fit, once in each process."
@@ -138,10 +137,9 @@ def _is_known(name: str, value: bool | int | str) -> bool:
     return True
 
 
-def worth_compiling(fits: int, harmonics: bool = True) -> bool:
-    """Whether so many fits, of harmonics or in time, are sooner done if they are compiled."""
-    enough = WORTH_COMPILING if harmonics else WORTH_COMPILING_IN_TIME
-    return fits >= enough or not _by_numpy()
+def worth_compiling(fits: int) -> bool:
+    """Whether so many fits in time are sooner done if they are compiled."""
+    return fits >= WORTH_COMPILING or not _by_numpy()
 
 
 def _by_numpy() -> bool:
