@@ -137,6 +137,16 @@ def test_elements_satisfy_equations_10_to_12(circuit):
     assert abs(abs(z(1j / (r_p * c_p))) - magnitude) < 1e-9 * magnitude  # eq. (12)
 
 
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_a_filter_that_is_no_circuit_has_elements_that_are_negative(xp):
+    """The estimate is not corrected: its verdict says that it is not physical."""
+    less = Rational(*(xp.asarray(of) for of in ([1e3, -2e3], [1.0, -0.5])))
+    elements = np.asarray(skin_elements(less, FS).values())
+    assert elements[0] == pytest.approx(2e3)
+    assert elements[1] == pytest.approx(-4e3)
+    assert elements[2] < 0
+
+
 def test_the_magnitude_as_printed_costs_what_it_costs():
     """C_p where |Z(j/(R_p C_p))| is (2 R_s + R_p)/√2, as the paper prints it."""
     excess = []

@@ -331,4 +331,4 @@ def skin_elements(z_bio: Rational, sample_rate: Float[AnyArray, ""] | float) -> 
     total = (n[0] + n[1]) / (d[0] + d[1])  # s = 0 is z = 1, eq. (11)
     r_p = total - r_s
     tau = (d[0] - d[1]) / (d[0] + d[1]) / (2 * sample_rate)  # the pole, s = −1/(R_p C_p), eq. (12)
-    return SkinRC(r_s, r_p, tau / r_p)
+    return SkinRC.of_fit((r_s, r_p, tau / r_p))
