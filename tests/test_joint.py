@@ -14,7 +14,7 @@ from etid.recordings.study import Study
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from tests import kept_numbers
-from tests.skins import DRY, off
+from tests.skins import DAMP, DRY, off
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
@@ -222,3 +222,14 @@ def test_a_driver_that_changed_after_its_calibration_is_no_success(study):
     assert "successful" not in mixed.fits.counts()
     assert "inconsistent" in mixed.fits.counts()
     assert {d.verdict for d in mixed.drivers.values()} == {"inconsistent"}
+
+
+@pytest.mark.parametrize(("circuit", "snr_db", "seed"), [(DRY, 21.8, 28), (DAMP, 26.8, 9)])
+def test_noisy_studies_come_to_their_minimum(circuit, snr_db, seed):
+    """From the own parameters that loads have alone, with a Z_th each, the search never ended."""
+    loaded = tuple(Trial(f"loaded/{i}", circuit) for i in range(6))
+    options = {"shared_v_th": circuit is DAMP, "trigger_jitter_rms": 50e-9}
+    scene = Scene(loaded, KNOWN, snr_db=snr_db, **options)
+    fits = etid.identify_jointly(scene.simulate(seed)).fits
+    assert (fits.verdicts == "successful").all()
+    assert (np.asarray(fits.fit.steps) < 40).all()

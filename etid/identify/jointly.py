@@ -223,12 +223,13 @@ class _Group:
 
     def judged(self, found: Estimate) -> Fit:
         """Fits with their verdicts."""
-        names = self.circuit.names()
-        told = np.asarray(self.circuit.values()) if self.prior is None else self.prior.told
-        width = np.full(len(names), np.inf) if self.prior is None else self.prior.width
+        count, told, width = len(self.circuit.names()), 1.0, np.inf
+        if self.prior is not None:
+            told, width = self.prior.told, self.prior.width
         changed = np.zeros(len(self.starts), bool)  # they take no part
-        of = self.circuit, self.driver.result, changed, METHOD, np.asarray(told), np.asarray(width)
-        return judged(found, *of, self.bounds)
+        known = (np.broadcast_to(of, count) for of in (told, width))
+        of = self.circuit, self.driver.result, changed, METHOD
+        return judged(found, *of, *known, self.bounds)
 
     def concluded(self, fits: Fit, driver: HarmonicDriver, narrow: AnyArray) -> Fit:
         """Fits with remarks, with the verdicts of recordings that take no part, and with changes.
