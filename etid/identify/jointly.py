@@ -227,9 +227,9 @@ class _Group:
         if self.prior is not None:
             told, width = self.prior.told, self.prior.width
         changed = np.zeros(len(self.starts), bool)  # they take no part
-        known = (np.broadcast_to(of, count) for of in (told, width))
+        told, width = (np.broadcast_to(one, count) for one in (told, width))
         of = self.circuit, self.driver.result, changed, METHOD
-        return judged(found, *of, *known, self.bounds)
+        return judged(found, *of, told, width, self.bounds)
 
     def concluded(self, fits: Fit, driver: HarmonicDriver, narrow: AnyArray) -> Fit:
         """Fits with remarks, with the verdicts of recordings that take no part, and with changes.
