@@ -372,6 +372,7 @@ def _check_steady(study: Study, instrument: Instrument | None) -> None:
 
 
 @one_thread()
+@array_function
 def _fit_together(groups: Sequence[_Group]) -> tuple[list[Fit], HarmonicDriver]:
     """The fits of all recordings of one driver, by group, and the driver."""
     driver, loads = groups[0].driver, [group.loads() for group in groups]

@@ -90,10 +90,10 @@ def fit(
             (load, own) for each length.
         told: The instrument as it is stated; that of the calibrations has all errors of a budget.
     """
-    # Alone, each load has had a Z_th of its own; behind another one it is far from its minimum.
-    owns = [_behind(of, start, *one)[0] for one in zip(groups, owns, strict=True)]
     used = [loads.of(loads.used) for loads in groups if loads.used.any()]
     starts = [own[of.used] for own, of in zip(owns, groups, strict=True) if of.used.any()]
+    # Alone, each load has had a Z_th of its own; behind another one it is far from its minimum.
+    starts = [_behind(of, start, *one)[0] for one in zip(used, starts, strict=True)]
     least = minimum(of, used, start, starts)
     found, each = iter(least.owns), []
     for loads, own in zip(groups, owns, strict=True):
