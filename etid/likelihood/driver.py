@@ -126,12 +126,20 @@ class Minimum(NamedTuple):
     points: Int[AnyArray, "*row"]
 
 
+class _Followed(NamedTuple):
+    """The minimum at the knots near a point, what it promises, and the curvature there."""
+
+    q: Float[AnyArray, "*row q"]
+    promised: Float[AnyArray, "*row"]
+    matrix: Float[AnyArray, "*row q q"]
+
+
 class _State(NamedTuple):
     """Where the search is: the best point, what is known there, and the next one."""
 
     near: Near
     objective: Float[AnyArray, "*row"]
-    matrix: Float[AnyArray, "*row q q"]
+    ahead: _Followed
     target: Float[AnyArray, "*row q"]
     trial: Float[AnyArray, "*row q"]
     settled: Bool[AnyArray, "*row"]
@@ -149,31 +157,23 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
         near, (weak, _) = model.near(q), model.weak(q)
         return near, near.objective + 0.5 * (weak**2).sum(-1)
 
-    def followed(near: Near, unit: Float[AnyArray, "*row"]) -> tuple[AnyArray, ...]:
-        """The minimum at the knots, what it promises, and the curvature there."""
+    def followed(near: Near, unit: Float[AnyArray, "*row"]) -> _Followed:
         problem = AtKnots(model, near)
         first, enough = problem.at(near.q, near.slopes), (WELL * BEFORE) ** 2 * unit
         found = LevenbergMarquardt(1e-6, MAX_STEPS, PATIENCE, True)(problem, near.q, first, enough)
         # A fit that did not settle promises everything: it is at no minimum.
         left = xp.where(found.moves, -np.inf, found.equations.objective)
-        return found.q, first.objective - left, found.equations.matrix
+        return _Followed(found.q, first.objective - left, found.equations.matrix)
 
-    def going(
-        near: Near,
-        objective: AnyArray,
-        last: AnyArray,
-        better: AnyArray,
-        reduced: AnyArray,
-        counts: tuple[AnyArray, AnyArray],
-    ) -> _State:
-        idle, points = counts
+    def ahead(near: Near, objective: AnyArray, better: AnyArray, before: _Followed) -> _Followed:
+        """The minimum at the knots near the best points, of which only better ones are new."""
         unit = objective / model.terms
-        *found, matrix = followed(near, unit)
-        of = (found[0], found[1]), last, better, reduced, idle
-        to = decided(near.q, objective, unit, *of)
-        moves, points = ~to.settled & xp.isfinite(objective), points + 1
-        at = near, objective, matrix
-        return _State(*at, to.target, to.trial, to.settled, to.idle, points, moves)
+        if xp is not np or start.ndim == 1 or better.all():
+            return select(better, followed(near, unit), before)
+        rows = np.flatnonzero(better)
+        return (
+            replaced(before, rows, followed(taken(near, rows), unit[rows])) if rows.size else before
+        )
 
     def step(state: _State) -> _State:
         if xp is np and start.ndim > 1 and not state.moves.all():
@@ -182,17 +182,33 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
         near, objective = evaluated(state.trial)
         reduced = state.objective - objective
         better = reduced >= 0
-        kept = select(better, (near, objective), (state.near, state.objective))
-        found = going(*kept, state.trial, better, reduced, (state.idle, state.points))
-        return select(state.moves, found, state)
+        best = select(better, (near, objective), (state.near, state.objective))
+        of = ahead(*best, better, state.ahead), state.trial, better, reduced, state.idle
+        return select(state.moves, decision(*best, *of, state.points), state)
+
+    def decision(
+        near: Near,
+        objective: AnyArray,
+        found: _Followed,
+        last: AnyArray,
+        better: AnyArray,
+        reduced: AnyArray,
+        idle: AnyArray,
+        points: AnyArray,
+    ) -> _State:
+        of = found[:2], last, better, reduced, idle
+        to = decided(near.q, objective, objective / model.terms, *of)
+        moves = ~to.settled & xp.isfinite(objective)
+        going = to.target, to.trial, to.settled, to.idle, points + 1, moves
+        return _State(near, objective, found, *going)
 
     near, objective = evaluated(start)
     none = xp.zeros(objective.shape, int)
-    better = xp.isfinite(objective)
-    first = going(near, objective, start, better, xp.zeros_like(objective), (none, none))
-    last = repeated(step, first, POINTS - 1)
+    found = followed(near, objective / model.terms)
+    of = start, xp.isfinite(objective), xp.zeros_like(objective), none, none
+    last = repeated(step, decision(near, objective, found, *of), POINTS - 1)
     q = xp.where(last.settled[..., None], last.target, last.near.q)
-    return Minimum(q, last.objective, last.matrix, last.settled, last.points)
+    return Minimum(q, last.objective, last.ahead.matrix, last.settled, last.points)
 
 
 @array_function

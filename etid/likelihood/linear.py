@@ -319,6 +319,8 @@ def conjugate_gradients(
 ) -> Float[AnyArray, " q"]:
     """Solution of H x = b under JAX, with derivatives in b.
 
+    `jax.scipy.sparse.linalg.cg` fails in the gradient of many rows (`jax.vmap`).
+
     Args:
         product: H times a vector; H is positive definite.
         inverse: Nearly the inverse of H; the better it is, the fewer products are needed.
