@@ -17,6 +17,8 @@ from etid.likelihood.gains import FAULTS, Slopes
 from etid.likelihood.noise import excess
 from etid.likelihood.profile import Condensed, Profile, Records, added
 from etid.likelihood.sandwich import Linear
+from etid.likelihood.shared import Calibrated
+from etid.likelihood.source import Source, Tolerances
 from etid.likelihood.source_prior import DELAY_WIDTH, SourcePrior, delay_width
 from etid.precision import array_function, namespace
 from etid.results.driver import Calibration, HarmonicDriver
@@ -28,6 +30,7 @@ from etid.signals.knots import Knots, knots
 from etid.signals.transfer import (
     AnyArray,
     as_complex,
+    combined,
     delayed,
     frequency_variable,
     power,
@@ -254,6 +257,47 @@ class Calibrations:
         rows = [by_source, np.eye(f.shape[0])[:, :, None] * by_delay]
         rows += [] if by_error is None else [by_error]
         return Slopes(z_th, gains, by_z, by_z, xp.concatenate(rows, -3))
+
+    @array_function
+    def around(
+        self,
+        common: Float[AnyArray, " common"],
+        directions: Float[AnyArray, "common z"],
+        frequency: Float[AnyArray, " bin"],
+    ) -> Source:
+        """Z_th with these common parameters, for loads; its z are steps along `directions`."""
+        xp, source = namespace(common, frequency), self.source_of(common)
+        z_th, by_source = source.with_slopes(frequency)
+        resistance = self.calibration.r_load.mean()
+        loaded = z_th + as_complex(resistance)
+        by_source = by_source * reciprocal(loaded)
+        zero, tolerances = xp.zeros(directions.shape[1]), None
+        if self.instrument is not None:
+            sizes = self.tolerances[:FAULTS]
+            by_z = self.errors(directions.T)[:, :FAULTS] * sizes
+            faults = sizes * self.errors(common)[:FAULTS]
+            tolerances = Tolerances(faults, by_z, None, xp.zeros(()), zero)
+        return Source(
+            frequency=frequency,
+            loaded=loaded,
+            w_slope=-by_source[source.log_omegas].sum(0),
+            by_z=combined(directions[: by_source.shape[0]].T, by_source),
+            resistance=resistance,
+            mean=zero,
+            cov=xp.diag(zero),
+            delay_width=xp.asarray(self.delay_width),
+            tolerances=tolerances,
+        )
+
+    @array_function
+    def calibrated(
+        self, common: Float[AnyArray, " common"], directions: Float[AnyArray, "common z"]
+    ) -> Calibrated:
+        """The calibrations, whose unloaded record a load may have; for z see `around`."""
+        found, s = self.slopes(common), self.spectra
+        by_z = combined(directions.T, found.by_q.reshape(common.shape[0], -1))
+        by_z = by_z.reshape(-1, *found.gains.shape)
+        return Calibrated(s.x, s.y, s.variance_y, s.selected, found.gains, by_z)
 
     @array_function
     def near(self, common: Float[AnyArray, "*row common"]) -> Near:

@@ -49,7 +49,7 @@ from etid.precision import Module, array_function, namespace
 from etid.results.driver import HarmonicDriver
 from etid.results.instrument import BUDGETED, Instrument
 from etid.signals.harmonics import Spectrum
-from etid.signals.transfer import AnyArray, as_complex, combined, frequency_variable, reciprocal
+from etid.signals.transfer import AnyArray, as_complex, frequency_variable, reciprocal
 from etid.solvers.matrices import inverse_root
 
 
@@ -208,31 +208,20 @@ def around(
     cov: Float[AnyArray, "z z"],
 ) -> GivenDriver:
     """A driver around the common parameters c, with z along `directions`; like `given`."""
-    resistance = calibrations.calibration.r_load.mean()
-    source, gains = calibrations.source_of(c), None
-    z_th, by_source = source.with_slopes(frequency)
-    loaded = z_th + as_complex(resistance)
-    by_source = by_source * reciprocal(loaded)[None, :]
-    known = None
-    if shared:
-        of = calibrations.slopes(c)
-        gains, known = of.gains, combined(directions.T, of.by_q.reshape(c.size, -1))
-        known = known.reshape(-1, *gains.shape)
-    faults = None
-    if calibrations.instrument is not None:
-        sizes, along = calibrations.tolerances[:FAULTS], calibrations.errors(directions.T)
-        faults = sizes * calibrations.errors(c)[:FAULTS], along[:, :FAULTS] * sizes[None]
+    source = calibrations.around(c, directions, frequency)
+    known = calibrations.calibrated(c, directions) if shared else None
+    of = source.tolerances
     return GivenDriver(
         frequency=frequency,
-        loaded=loaded,
-        w_slope=-by_source[source.log_omegas].sum(0),
-        slope=combined(directions[: by_source.shape[0]].T, by_source),
-        resistance=resistance,
+        loaded=source.loaded,
+        w_slope=source.w_slope,
+        slope=source.by_z,
+        resistance=source.resistance,
         mean=mean,
         cov=cov,
         records=calibrations.spectra if shared else None,
-        gains=gains,
-        gain_slopes=known,
-        delay_width=calibrations.delay_width,
-        faults=faults,
+        gains=None if known is None else known.gains,
+        gain_slopes=None if known is None else known.gains_by_z,
+        delay_width=source.delay_width,
+        faults=None if of is None else (of.faults, of.faults_by_z),
     )

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from etid.likelihood import scores
 from etid.likelihood.calibrations import Calibrations
-from etid.likelihood.joint.loads import Loads, around, calibrated
+from etid.likelihood.joint.loads import Loads
 from etid.likelihood.linear import inverse
 from etid.likelihood.noise import excess
 from etid.likelihood.profile import rrse
@@ -114,8 +114,8 @@ def at_minimum(
 ) -> AtMinimum:
     """Loads of one length at their minima."""
     unit = np.eye(common.size)
-    source = around(of, common, unit, loads.frequency)
-    known = None if loads.same is None else calibrated(of, common, unit)
+    source = of.around(common, unit, loads.frequency)
+    known = None if loads.same is None else of.calibrated(common, unit)
 
     def few(loads: Loads, owns: AnyArray) -> AtMinimum:
         load, own = loads.behind(source, known), owns.shape[1]
@@ -144,7 +144,7 @@ def at_minimum(
             by_x=by_noise(jacobian, brought),
         )
 
-    parts = [few(some, owns[rows]) for rows, some in loads.in_turn()]
+    parts = [few(some, owns[rows]) for rows, some in loads.parts()]
     return jax.tree.map(lambda *each: np.concatenate(each), *parts)
 
 

@@ -14,7 +14,7 @@ from etid.likelihood import scores
 from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.fit import Estimate, beyond
 from etid.likelihood.joint.errors import AtMinimum, Common, Eliminated, at_minimum, tested
-from etid.likelihood.joint.loads import Loads, around, calibrated
+from etid.likelihood.joint.loads import Loads
 from etid.likelihood.joint.minimum import minimum
 from etid.likelihood.linear import diagonal
 from etid.likelihood.search import minimum as minimum_alone
@@ -192,11 +192,10 @@ def _behind(
 ) -> tuple[Float[np.ndarray, "load own"], Bool[np.ndarray, " load"]]:
     """The own parameters of loads behind a given Z_th, and whether they are at their minima."""
     none = np.zeros((common.size, 0))
-    source = around(of, common, none, loads.frequency)
-    known = None if loads.same is None else calibrated(of, common, none)
+    source = of.around(common, none, loads.frequency)
+    known = None if loads.same is None else of.calibrated(common, none)
     each = [
-        minimum_alone(few.behind(source, known), starts[None, rows])
-        for rows, few in loads.in_turn()
+        minimum_alone(few.behind(source, known), starts[None, rows]) for rows, few in loads.parts()
     ]
     owns, settled = [one.q for one in each], [one.settled for one in each]
     return np.concatenate(owns), np.concatenate(settled)

@@ -14,11 +14,11 @@ from etid.likelihood.calibrations import DENSE, Calibrations
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.search import ROWS, Load
 from etid.likelihood.shared import Calibrated, Unloaded
-from etid.likelihood.source import Source, Tolerances
-from etid.precision import array_function, namespace
+from etid.likelihood.source import Source
+from etid.precision import namespace
 from etid.signals import modal
-from etid.signals.knots import DENSITY
-from etid.signals.transfer import AnyArray, as_complex, combined, reciprocal
+from etid.signals.knots import DENSITY, knots
+from etid.signals.transfer import AnyArray, as_complex, reciprocal
 
 W = 2  # number of signals of W: real and imaginary part
 
@@ -56,7 +56,7 @@ class Loads:
         same = None if self.same is None else self.same[rows]
         return Loads(self.load.of(rows), same, self.used[rows], self.unloaded[rows])
 
-    def in_turn(self) -> Iterator[tuple[np.ndarray, "Loads"]]:
+    def parts(self) -> Iterator[tuple[np.ndarray, "Loads"]]:
         """A few recordings at a time, and their numbers."""
         for first in range(0, self.count, ROWS):
             rows = np.arange(first, min(first + ROWS, self.count))
@@ -83,48 +83,6 @@ class Loads:
         )
 
 
-@array_function
-def around(
-    of: Calibrations,
-    common: Float[AnyArray, " common"],
-    directions: Float[AnyArray, "common z"],
-    frequency: Float[AnyArray, " bin"],
-) -> Source:
-    """Z_th with these common parameters; its z are steps along `directions`."""
-    xp, source = namespace(common, frequency), of.source_of(common)
-    z_th, by_source = source.with_slopes(frequency)
-    resistance = as_complex(of.calibration.r_load.mean())
-    by_source = by_source * reciprocal(z_th + resistance)
-    zero, tolerances = xp.zeros(directions.shape[1]), None
-    if of.instrument is not None:
-        sizes = of.tolerances[:FAULTS]
-        by_z = of.errors(directions.T)[:, :FAULTS] * sizes
-        faults = of.errors(common)[:FAULTS] * sizes
-        tolerances = Tolerances(faults, by_z, None, xp.zeros(()), zero)
-    return Source(
-        frequency=frequency,
-        loaded=z_th + resistance,
-        w_slope=-by_source[source.log_omegas].sum(0),
-        by_z=combined(directions[: len(by_source)].T, by_source),
-        resistance=of.calibration.r_load.mean(),
-        mean=zero,
-        cov=xp.diag(zero),
-        delay_width=xp.asarray(of.delay_width),
-        tolerances=tolerances,
-    )
-
-
-@array_function
-def calibrated(
-    of: Calibrations, common: Float[AnyArray, " common"], directions: Float[AnyArray, "common z"]
-) -> Calibrated:
-    """The calibrations, whose unloaded record a load may have; for z see `around`."""
-    found, s = of.slopes(common), of.spectra
-    by_z = combined(directions.T, found.by_q.reshape(len(common), -1))
-    by_z = by_z.reshape(-1, *found.gains.shape)
-    return Calibrated(s.x, s.y, s.variance_y, s.selected, found.gains, by_z)
-
-
 @dataclasses.dataclass(frozen=True)
 class Signals:
     """Functions of frequency through which a driver acts on loads of one length.
@@ -144,11 +102,7 @@ class Signals:
     @property
     def frequency(self) -> Float[np.ndarray, " knot"]:
         """The knots [Hz]."""
-        return self.loads.frequency[..., self._dense.knots.index]
-
-    @property
-    def _dense(self) -> Load:
-        return dataclasses.replace(self.loads.load, density=DENSE)
+        return knots(self.loads.frequency.size, DENSE).at(self.loads.frequency)
 
     @property
     def _faults(self) -> int:
@@ -196,11 +150,12 @@ class Signals:
     def behind(self, common: Float[AnyArray, " common"], loads: Loads) -> Load:
         """Some of the loads; z are the signals at each harmonic, and 0."""
         of, xp = self.calibrations, namespace(common)
-        source = around(of, common, xp.zeros((common.shape[0], 0)), loads.frequency)
+        nothing = xp.zeros((common.shape[0], 0))
+        source = of.around(common, nothing, loads.frequency)
         known, count = None, self.smooth
         unit = np.array([1.0, 1.0j])
         if loads.same is not None:
-            at, records = calibrated(of, common, xp.zeros((common.shape[0], 0))), len(of.spectra.x)
+            at, records = of.calibrated(common, nothing), len(of.spectra.x)
             count += W * records
             alone = np.zeros((count, records), complex)
             alone[self.smooth :] = np.kron(np.eye(records), unit[:, None])

@@ -239,7 +239,7 @@ def minimum(
 def _part(of: Signals, common: Float[np.ndarray, " common"], owns: AnyArray) -> Part:
     """The loads of one length near a point."""
     parts = [
-        _of_few(of.behind(common, few), of.smooth, owns[rows]) for rows, few in of.loads.in_turn()
+        _of_few(of.behind(common, few), of.smooth, owns[rows]) for rows, few in of.loads.parts()
     ]
     value, pull, curvature, *each = zip(*parts, strict=True)
     sums = sum(value), np.sum(pull, axis=0), np.sum(curvature, axis=0)
