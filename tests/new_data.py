@@ -52,7 +52,6 @@ class SkinAndKnown(etid.SkinRC):
 def fit(gains: Gains, records: Records) -> etid.Fit:
     """The loads of recordings, side by side."""
     load, circuit = load_with(gains, records), gains.circuit
-    none, unknown = np.ones(gains.elements), np.full(gains.elements, np.inf)
     changed = np.zeros(len(records.x), bool)
-    of = circuit, verdict("successful"), changed, "new data", none, unknown
+    of = circuit, changed, verdict("successful"), "new data", None, ()
     return judged(estimated(load, starts(load)), *of)

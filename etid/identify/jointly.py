@@ -7,11 +7,11 @@ standard errors separate the own error of a trial from the error that all trials
 
 import contextlib
 import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
-import jax
 import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
@@ -26,7 +26,7 @@ from etid.estimators.maximum_likelihood.estimator import (
     NO_OTHER_GAIN,
     description,
 )
-from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
+from etid.estimators.maximum_likelihood.rows import estimates, loads_of, source_of
 from etid.estimators.maximum_likelihood.verdict import judged
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import check_new, require
@@ -52,13 +52,9 @@ from etid.identify.planning import Refusal, batches, failed_fit
 from etid.identify.study import Drivers, common_first, fields_of, table
 from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.fit import Estimate
-from etid.likelihood.fit import fit as fit_alone
 from etid.likelihood.joint.fit import Delays, Found, start_of
 from etid.likelihood.joint.fit import fit as fit_together
 from etid.likelihood.joint.loads import Loads
-from etid.likelihood.search import ROWS
-from etid.likelihood.starts import starts as starts_of
-from etid.likelihood.unloaded import differs
 from etid.numpy_tier.algebra import one_thread
 from etid.precision import array_function, in_float64, untraced
 from etid.recordings.errors import RecordingError
@@ -184,29 +180,20 @@ class _Group:
         self.unloaded += map(checksum, batch.seen)
         self.repeats += repeats(batch.seen)
 
-    def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
-        parts = [lanes[first : first + ROWS] for first in range(0, len(lanes), ROWS)]
-        return [one for few in parts for one in self._of_few(few)]
-
     @one_thread()
     @array_function
-    def _of_few(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
-        lanes = cast("Sequence[Harmonics]", lanes)  # the method checks it
-        source = source_of(self.known)
-        load = loads_of(lanes, source, self.circuit, self.prior, calibrated(self.known))
-        found = fit_alone(load, starts_of(load))
-        errors = np.zeros((len(lanes), 0))
-        if source.tolerances is not None and source.errors is not None:
-            errors = source.errors.at + found.z @ source.errors.by_z
-        changed = np.zeros(len(lanes), bool)
-        if self.known.shape is not None:
-            changed = differs(jax.tree.map(np.asarray, self.known.shape), load.records)
-        good = found.settled & np.isfinite(found.chi2) & ~misses(found.chi2, found.rrse)
-        used = good & ~changed & ~found.other & ~(found.strain > STRAINED)
-        signs = used, found.hum, found.falls, changed, found.other
-        return [
-            _Start(*of) for of in zip(lanes, found.logs, found.delays, errors, *signs, strict=True)
-        ]
+    def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
+        every, of, parts = cast("Sequence[Harmonics]", lanes), source_of(self.known).errors, []
+        for found, changed in estimates(every, self.known, self.circuit, self.prior):
+            errors = np.zeros((len(changed), 0))
+            if self.driver.instrument is not None and of is not None:
+                errors = of.at + found.z @ of.by_z
+            good = found.settled & np.isfinite(found.chi2) & ~misses(found.chi2, found.rrse)
+            used = good & ~changed & ~found.other & ~(found.strain > STRAINED)
+            signs = used, found.hum, found.falls, changed, found.other
+            parts.append(zip(found.logs, found.delays, errors, *signs, strict=True))
+        each = itertools.chain.from_iterable(parts)
+        return [_Start(lane, *numbers) for lane, numbers in zip(every, each, strict=True)]
 
     def loads(self) -> Loads:
         """The recordings for a joint fit."""
@@ -214,7 +201,7 @@ class _Group:
         load = loads_of(lanes, source_of(self.known), self.circuit, self.prior, None)
         of, same = self.known.records, None
         if of is not None and of.x.shape[-1] == load.records.x.shape[-1]:
-            same = np.array([[same_unloaded(x, one) for one in of.x] for x in load.records.x])
+            same = np.asarray(same_unloaded(load.records.x[:, None], of.x))
         several = [key for key, count in Counter(self.unloaded).items() if count > 1]
         number = {key: i for i, key in enumerate(several)}
         unloaded = np.array([number.get(key, -1) for key in self.unloaded])
@@ -223,13 +210,9 @@ class _Group:
 
     def judged(self, found: Estimate) -> Fit:
         """Fits with their verdicts."""
-        count, told, width = len(self.circuit.names()), 1.0, np.inf
-        if self.prior is not None:
-            told, width = self.prior.told, self.prior.width
         changed = np.zeros(len(self.starts), bool)  # they take no part
-        told, width = (np.broadcast_to(one, count) for one in (told, width))
-        of = self.circuit, self.driver.result, changed, METHOD
-        return judged(found, *of, told, width, self.bounds)
+        of = self.driver.result, METHOD, self.prior, self.bounds
+        return judged(found, self.circuit, changed, *of)
 
     def concluded(self, fits: Fit, driver: HarmonicDriver, narrow: AnyArray) -> Fit:
         """Fits with remarks, with the verdicts of recordings that take no part, and with changes.

@@ -1,6 +1,6 @@
 """Loads fitted as rows of arrays, by `etid.likelihood`, behind a driver that is given."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -14,7 +14,7 @@ from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, stacked
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.verdict import judged, judged_one
 from etid.likelihood.calibrations import Calibrations
-from etid.likelihood.fit import fit, shows_other_circuit
+from etid.likelihood.fit import Estimate, fit, shows_other_circuit
 from etid.likelihood.gains import Gains, Voltage, VoltageAndCurrent
 from etid.likelihood.profile import Records
 from etid.likelihood.search import ROWS, Load
@@ -145,6 +145,26 @@ def other_circuit_at(
     return shows_other_circuit(load, xp.concatenate([own, z]))
 
 
+def estimates(
+    lanes: Sequence[Harmonics],
+    known: GivenDriver,
+    circuit: AbstractCircuit,
+    prior: ElementPrior | None,
+) -> Iterator[tuple[Estimate, Bool[np.ndarray, " row"]]]:
+    """Fits of recordings of equal length and rates without their verdicts, a few at a time.
+
+    Beside each stands whether its unloaded voltage shows that the driver has changed.
+    """
+    known = jax.tree.map(np.asarray, known)
+    source, shared = source_of(known), calibrated(known)
+    for first in range(0, len(lanes), ROWS):
+        load = loads_of(lanes[first : first + ROWS], source, circuit, prior, shared)
+        changed = np.zeros(len(load.records.x), bool)
+        if known.shape is not None:
+            changed = differs(known.shape, load.records)
+        yield fit(load, starts(load), float(known.aside)), changed
+
+
 @one_thread()
 @array_function
 def fit_rows(
@@ -157,16 +177,6 @@ def fit_rows(
     bounds: Limits = (),
 ) -> list[Fit]:
     """The fits of recordings of equal length and rates, in chunks that are stacked."""
-    known = jax.tree.map(np.asarray, known)
-    source, shared, found = source_of(known), calibrated(known), []
-    for first in range(0, len(lanes), ROWS):
-        load = loads_of(lanes[first : first + ROWS], source, circuit, prior, shared)
-        estimate = fit(load, starts(load), float(known.aside))
-        changed = np.zeros(len(load.records.x), bool)
-        if known.shape is not None:
-            changed = differs(known.shape, load.records)
-        count = load.gains.elements
-        told = np.exp(load.centre[:count]) if prior is None else np.asarray(prior.told)
-        of = circuit, driver.result, changed, method, told, load.width[:count], bounds
-        found.append(judged(estimate, *of))
-    return found
+    of = driver.result, method, prior, bounds
+    every = estimates(lanes, known, circuit, prior)
+    return [judged(found, circuit, changed, *of) for found, changed in every]

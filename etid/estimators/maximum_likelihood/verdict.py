@@ -27,25 +27,27 @@ from etid.results.verdicts import RESULTS, verdicts_of
 def judged(
     found: Estimate,
     circuit: AbstractCircuit,
-    driver: RESULTS,
     changed: Bool[np.ndarray, " row"],
+    driver: RESULTS,
     method: str,
-    told: Float[np.ndarray, " element"],
-    width: Float[np.ndarray, " element"],
-    bounds: Limits = (),
+    prior: ElementPrior | None,
+    bounds: Limits,
 ) -> Fit:
     """The fits with their verdicts.
 
     Args:
         found: The estimates.
         circuit: Structure of the load.
-        driver: Verdict of the driver.
         changed: Whether unloaded voltages show that the driver has changed.
+        driver: Verdict of the driver.
         method: Name of the method.
-        told: Values of the elements that are known [SI].
-        width: Standard deviations of their logarithms; infinite for an element that is not known.
+        prior: What is known of the elements; None if nothing is.
         bounds: Bounds of elements; those of elements that the circuit lacks do not count.
     """
+    count = found.logs.shape[-1]
+    told, width = np.ones(count), np.full(count, np.inf)
+    if prior is not None:
+        told, width = np.asarray(prior.told), np.asarray(prior.width)
     own = of_circuit(bounds, circuit)
     found = _ordered(found, circuit, told, width, own)
     values, support = np.exp(found.logs), found.support
