@@ -8,7 +8,7 @@ Formulas compute in the namespace of their arrays, NumPy or JAX.
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
@@ -69,6 +69,15 @@ def held(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]
         return traced(*args, **kwargs)
 
     return call
+
+
+def in_turn(step: Callable[..., Any], state: Any, arguments: Sequence[Any]) -> Any:
+    """Steps with each of the arguments: a loop of Python for NumPy, one of JAX for JAX."""
+    if namespace(*jax.tree.leaves((state, arguments))) is np:
+        for of in zip(*arguments, strict=True):
+            state = step(state, *of)
+        return state
+    return jax.lax.scan(lambda state, of: (step(state, *of), None), state, tuple(arguments))[0]
 
 
 def in_float64(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

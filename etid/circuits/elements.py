@@ -21,7 +21,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from etid.circuits.impedance import (
     AbstractImpedance,
@@ -96,7 +96,7 @@ class Resistance(AbstractRational):
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
-        return Rational(jnp.stack([jnp.asarray(self.r)]), jnp.ones(1))
+        return Rational(namespace(self.r).asarray(self.r)[None], np.ones(1))
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write the resistor into the netlist."""
@@ -129,8 +129,7 @@ class Capacitance(AbstractRational):
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
-        c = jnp.asarray(self.c)
-        return Rational(jnp.ones(1), jnp.stack([jnp.zeros_like(c), c]))
+        return Rational(np.ones(1), _of_first_order(self.c))
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write the capacitor into the netlist."""
@@ -154,8 +153,7 @@ class Inductance(AbstractRational):
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
-        inductance = jnp.asarray(self.inductance)
-        return Rational(jnp.stack([jnp.zeros_like(inductance), inductance]), jnp.ones(1))
+        return Rational(_of_first_order(self.inductance), np.ones(1))
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write the inductor into the netlist."""
@@ -197,22 +195,22 @@ class ConstantPhase(AbstractIrrational):
         """Exponent α."""
         return (self.alpha,)
 
-    def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
+    def state_space(self, rate: float | Float[AnyArray, ""], samples: int) -> StateSpace:
         """The ladder of relaxations from below the slowest to above the fastest time of a record.
 
         R_k and C_k of the pairs cover eight decades. The states are scaled so that the system stays
         nearly symmetric in a loop with a source; its matrix exponential loses no digits then.
         """
-        x = jnp.asarray(_corners(SLOWEST / samples, FASTEST)) * rate
-        alpha, q = jnp.asarray(self.alpha), jnp.asarray(self.q)
+        xp, x = namespace(self.q, self.alpha, rate), _corners(SLOWEST / samples, FASTEST) * rate
+        alpha, q = xp.asarray(self.alpha), xp.asarray(self.q)
         level, slower, faster = _ladder(q, alpha, x)
-        rises = jnp.append(level * x ** (1 - alpha), slower)  # R_k x_k and 1/C [Ω/s]
+        rises = xp.append(level * x ** (1 - alpha), slower)  # R_k x_k and 1/C [Ω/s]
         unit = 1 / (q * rate ** (1 + alpha))  # |Z| at the sample rate, divided by it [Ω s]
-        share = jnp.append(jnp.full(x.shape, 1 - alpha), 1.0)
+        share = xp.append(xp.full(x.shape, 1 - alpha), 1.0)
         return StateSpace(
-            jnp.diag(jnp.append(-x, 0.0)),
-            jnp.sqrt(rises / unit)[:, None],
-            jnp.sqrt(rises * unit) * share,
+            xp.diag(xp.append(-x, 0.0)),
+            xp.sqrt(rises / unit)[:, None],
+            xp.sqrt(rises * unit) * share,
             faster[None],
         )
 
@@ -265,21 +263,22 @@ class Diffusion(AbstractIrrational):
         """Empty: no exponent of it can exceed that of a passive element."""
         return ()
 
-    def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
+    def state_space(self, rate: float | Float[AnyArray, ""], samples: int) -> StateSpace:
         """Its relaxations, for every τ up to the length of the record.
 
         Their states are scaled as in `ConstantPhase`. The slow ones are exact. Of the others, two
         stand for each `GROUP` of ln x.
         """
         x, weight = _relaxations(samples)
-        r, tau = jnp.asarray(self.r), jnp.asarray(self.tau)
-        unit = r / (rate * jnp.sqrt(rate * tau))  # |Z| at the sample rate, divided by it [Ω s]
-        rises = r * jnp.asarray(weight * x) / tau
+        xp = namespace(self.r, self.tau, rate)
+        r, tau = xp.asarray(self.r), xp.asarray(self.tau)
+        unit = r / (rate * xp.sqrt(rate * tau))  # |Z| at the sample rate, divided by it [Ω s]
+        rises = r * (weight * x) / tau
         return StateSpace(
-            jnp.diag(-jnp.asarray(x) / tau),
-            jnp.sqrt(rises / unit)[:, None],
-            jnp.sqrt(rises * unit),
-            (r * (1 - weight.sum()))[None],
+            xp.diag(-x / tau),
+            xp.sqrt(rises / unit)[:, None],
+            xp.sqrt(rises * unit),
+            xp.asarray(r * (1 - weight.sum()))[None],
         )
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
@@ -291,6 +290,13 @@ class Diffusion(AbstractIrrational):
         x = _poles(high * tau)
         pairs = [parallel(resistor(2 * r / one), capacitor(tau / (2 * r))) for one in x]
         series(resistor(r - float(np.sum(2 * r / x))), *pairs).connect(netlist, plus, minus)
+
+
+def _of_first_order(value: Quantity) -> Float[AnyArray, "2"]:
+    """The polynomial value · s."""
+    xp = namespace(value)
+    value = xp.asarray(value)
+    return xp.stack([xp.zeros_like(value), value])
 
 
 def _wide(z: Complex[AnyArray, "..."], s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
@@ -335,12 +341,13 @@ def _corners(low: float, high: float) -> Float[np.ndarray, " n"]:
 
 
 def _ladder(
-    q: Quantity, alpha: Quantity, x: Float[Array | np.ndarray, " n"]
-) -> tuple[Array, Array, Array]:
+    q: Quantity, alpha: Quantity, x: Float[AnyArray, " n"]
+) -> tuple[AnyArray, AnyArray, AnyArray]:
     """sin(πα) h / (πQ) without the factor 1 − α, 1/C of all slower and R of all faster pairs."""
-    level = jnp.sinc(1 - alpha) * STEP / q
-    slower = level * x[0] ** (1 - alpha) * (1 - alpha) / jnp.expm1(STEP * (1 - alpha))
-    faster = level * x[-1] ** -alpha * (1 - alpha) / jnp.expm1(STEP * alpha)
+    xp = namespace(q, alpha, x)
+    level = xp.sinc(1 - alpha) * STEP / q
+    slower = level * x[0] ** (1 - alpha) * (1 - alpha) / xp.expm1(STEP * (1 - alpha))
+    faster = level * x[-1] ** -alpha * (1 - alpha) / xp.expm1(STEP * alpha)
     return level, slower, faster
 
 

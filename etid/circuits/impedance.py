@@ -23,11 +23,10 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Inexact
 
-from etid.precision import Module
+from etid.precision import Module, namespace
 from etid.signals.filtering import StateSpace
 from etid.signals.transfer import AnyArray, Rational, reciprocal
 
@@ -116,7 +115,7 @@ class AbstractImpedance(Module):
         """Impedance [Ω] as a ratio of polynomials in s; ValueError if it is none."""
 
     @abc.abstractmethod
-    def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
+    def state_space(self, rate: float | Float[AnyArray, ""], samples: int) -> StateSpace:
         """System in continuous time from current [A] to voltage [V].
 
         It is exact for a ratio of polynomials in s. Other elements are ladders of relaxations,
@@ -150,7 +149,7 @@ class AbstractImpedance(Module):
         """Exponents of the powers of s. In a passive network each exponent is at most 1."""
         return sum((one.exponents() for one in self.elements()), start=())
 
-    def in_time(self, rate: float | Float[Array, ""], samples: int) -> Rational | StateSpace:
+    def in_time(self, rate: float | Float[AnyArray, ""], samples: int) -> Rational | StateSpace:
         """The impedance for a simulation: as a ratio of polynomials if it is one."""
         return self.rational() if self.is_rational else self.state_space(rate, samples)
 
@@ -203,7 +202,7 @@ class AbstractRational(AbstractElement):
         """Empty: a ratio of polynomials has no other exponents."""
         return ()
 
-    def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
+    def state_space(self, rate: float | Float[AnyArray, ""], samples: int) -> StateSpace:
         """System from current to voltage."""
         del samples
         return realise(self.rational(), rate)
@@ -219,7 +218,7 @@ class AbstractIrrational(AbstractElement):
             "the method maximum_likelihood, which evaluates Z(s) at harmonics"
         )
 
-    def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
+    def state_space(self, rate: float | Float[AnyArray, ""], samples: int) -> StateSpace:
         """Raise ValueError; an element with a ladder of relaxations replaces this method."""
         del rate, samples
         raise ValueError(f"{type(self).__name__} has no known response in time")
@@ -262,9 +261,9 @@ class Series(AbstractConnection):
         """Impedance [Ω] as a ratio of polynomials in s."""
         return reduce(Rational.add, [part.rational() for part in self.parts])
 
-    def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
+    def state_space(self, rate: float | Float[AnyArray, ""], samples: int) -> StateSpace:
         """Systems of the parts, driven by the same current."""
-        return reduce(_in_series, [part.state_space(rate, samples) for part in self.parts])
+        return reduce(in_series, [part.state_space(rate, samples) for part in self.parts])
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write the parts one after the other, with a new node between neighbours."""
@@ -305,7 +304,7 @@ class Parallel(AbstractConnection):
         parts = [part.rational().reciprocal() for part in self.parts]
         return reduce(Rational.add, parts).reciprocal()
 
-    def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
+    def state_space(self, rate: float | Float[AnyArray, ""], samples: int) -> StateSpace:
         """Systems of the parts, which share the current so that their voltages are equal."""
         return reduce(_in_parallel, [part.state_space(rate, samples) for part in self.parts])
 
@@ -332,7 +331,7 @@ def _added(parts: list[Slopes]) -> Slopes:
     return reduce(operator.add, values), list(itertools.chain(*slopes))
 
 
-def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
+def realise(impedance: Rational, rate: float | Float[AnyArray, ""]) -> StateSpace:
     """State space of a load impedance, from current [A] to voltage [V]."""
     order = impedance.den.shape[0] - 1
     if impedance.num.shape[0] > order + 1:
@@ -340,32 +339,37 @@ def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
             "the impedance of the load grows without bound at high frequency (an inductor in "
             "series?); a load must stay finite: put a resistor in parallel"
         )
-    scale = jnp.array([rate**k for k in range(order + 1)])
-    num = jnp.pad(impedance.num, (0, order + 1 - impedance.num.shape[0])) * scale
+    xp = namespace(impedance.num, impedance.den, rate)
+    scale = xp.stack([xp.asarray(rate**k, float) for k in range(order + 1)])
+    num = xp.pad(impedance.num, (0, order + 1 - impedance.num.shape[0])) * scale
     den = impedance.den * scale
     num, den = num / den[-1], den / den[-1]
     direct = num[-1]
-    A = jnp.concatenate([np.eye(order, k=1)[:-1], -den[None, :-1]])[:order]
-    B = jnp.asarray(np.eye(order, 1, k=1 - order))
+    A = xp.concatenate([np.eye(order, k=1)[:-1], -den[None, :-1]])[:order]
+    B = np.eye(order, 1, k=1 - order)
     return StateSpace(rate * A, rate * B, num[:-1] - direct * den[:-1], direct[None])
 
 
-def _in_series(one: StateSpace, other: StateSpace) -> StateSpace:
+def in_series(one: StateSpace, other: StateSpace) -> StateSpace:
+    """Two systems under the same current, whose voltages add."""
+    xp, count = namespace(one.A, other.A), (one.C.size, other.C.size)
+    above = xp.pad(one.A, ((0, 0), (0, count[1])))
+    below = xp.pad(other.A, ((0, 0), (count[0], 0)))
     return StateSpace(
-        jax.scipy.linalg.block_diag(one.A, other.A),
-        jnp.concatenate([one.B, other.B]),
-        jnp.concatenate([one.C, other.C]),
+        xp.concatenate([above, below]),
+        xp.concatenate([one.B, other.B]),
+        xp.concatenate([one.C, other.C]),
         one.D + other.D,
     )
 
 
 def _in_parallel(one: StateSpace, other: StateSpace) -> StateSpace:
     """The current i₁ = (C₂x₂ − C₁x₁ + D₂ i) / (D₁ + D₂) flows through the first part."""
-    total, both = one.D[0] + other.D[0], _in_series(one, other)
-    towards = jnp.concatenate([-one.C, other.C]) / total
-    first, second = jnp.ones_like(one.C), jnp.ones_like(other.C)
-    share = jnp.concatenate([first * other.D[0], second * one.D[0]]) / total
-    flows = both.B[:, 0] * jnp.concatenate([first, -second])
+    xp, first, second = namespace(one.A, other.A), np.ones(one.C.size), np.ones(other.C.size)
+    total, both = one.D[0] + other.D[0], in_series(one, other)
+    towards = xp.concatenate([-one.C, other.C]) / total
+    share = xp.concatenate([first * other.D[0], second * one.D[0]]) / total
+    flows = both.B[:, 0] * np.concatenate([first, -second])
     return StateSpace(
         both.A + flows[:, None] * towards[None, :],
         both.B * share[:, None],

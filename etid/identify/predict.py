@@ -3,46 +3,48 @@
 The Fourier coefficients describe a record of whole periods completely. The load acts on each
 coefficient separately: Y = G X, G = Z_L / (Z_L + Z_th). This suffices for a constant phase, which
 has no finite filter.
+
+Other records are simulated in time (`etid.signals.filtering`), with a state at their start that is
+fitted. Both ways fit the trigger delay of V_out and that of the calibration. A calibration with R_L
+that is late by τ yields Z_th + sτ (R_L + Z_th) in place of Z_th. A load Z_L then has the total
+
+    Z_L + Z_th + sτ (R_L + Z_th) = (1 + sτ) (Z_L + Z_th) + sτ (R_L − Z_L).
+
+The first part is a delay, which that of V_out absorbs. The second is an excess impedance.
 """
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
+from etid.circuits.impedance import realise
 from etid.estimators.estimator import serving
-from etid.estimators.lanes import AlignedSamples
-from etid.estimators.output_error import fit as output_error
-from etid.estimators.output_error import prediction
 from etid.estimators.registry import OUTPUT_ERROR
 from etid.identify.arguments import fed, given_circuit
-from etid.numpy_tier.tiers import program
-from etid.precision import in_float64
+from etid.numpy_tier.algebra import one_thread
+from etid.precision import array_function, held, in_float64, namespace, untraced
 from etid.recordings.inspection import Inspection
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import ContinuousDriver, Driver
-from etid.results.feed import MeasuredCurrent
-from etid.signals.filtering import TAPS
+from etid.results.feed import MeasuredCurrent, SourceImpedance
+from etid.signals.filtering import TAPS, StateSpace, band_limited, hold, shiftable, simulate
+from etid.signals.transfer import AnyArray
 
-
-@program
-def _fitted(
-    samples: AlignedSamples, driver: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
-) -> Float[Array, " interval"]:
-    records = prediction.prepare(samples.measure(), cutoff=0.5)  # the whole band of the record
-    load = circuit.impedance().in_time(records.sample_rate, records.hold.shape[0])
-    return output_error.fitted_voltage(records, driver.source, driver.r_known, load)
+PASSES = 3  # the first one leaves 1e-4 of two delays of 0.01 samples
+EPS = float(np.finfo(float).eps)
+WHOLE = 0.5  # cutoff of the interpolation: the whole band of the record
 
 
 @in_float64
+@one_thread()
 def predict(
     recording: Recording, driver: Driver | None = None, circuit: AbstractCircuit | str | None = None
-) -> Float[np.ndarray, " time"]:
+) -> Float[AnyArray, " time"]:
     """Predict the terminal voltage [V] of a recording, for plots and residuals.
 
-    The function fits the state at the start of the record and an offset to `recording.v_out`.
+    The function fits the state at the start of the record and an offset to `recording.v_out`. JAX
+    can differentiate it by the elements of the circuit.
 
     Args:
         recording: Unloaded and loaded voltage.
@@ -68,23 +70,22 @@ def predict(
     else:
         raise ValueError("give the circuit: this recording has no known resistor")
     if not isinstance(feed, MeasuredCurrent):
-        feed = serving(feed, ContinuousDriver, str(OUTPUT_ERROR))
+        feed = untraced(serving(feed, ContinuousDriver, str(OUTPUT_ERROR)))
     # Disturbed periods are predicted too.
     seen, simulated = Inspected(Inspection([recording])), load.impedance().has_response
     if not load.is_rational and (seen.whole_periods[0] > 0 or not simulated):
         if isinstance(feed, ContinuousDriver):
             return _predict_periods(Inspected.of(recording), feed, load)
         OUTPUT_ERROR.check_circuit(load)
-    inner = np.asarray(_fitted(jax.device_put(AlignedSamples.of(seen)), feed, load))
-    predicted = np.full(recording.v_out.size, np.nan)
+    inner = fitted_voltage(*seen.aligned, recording.sample_rate, feed, untraced(load))
     first = TAPS - 1 + max(seen.lag, 0)
-    predicted[first : first + inner.size] = inner
-    return predicted
+    edges = first, recording.v_out.size - first - inner.size
+    return namespace(inner).pad(inner, edges, constant_values=np.nan)
 
 
 def _predict_periods(
     seen: Inspected, driver: ContinuousDriver, circuit: AbstractCircuit
-) -> Float[np.ndarray, " time"]:
+) -> Float[AnyArray, " time"]:
     recording, rate = seen.recording, seen.recording.sample_rate
     periods, samples = seen.whole_periods
     if periods == 0:
@@ -93,28 +94,125 @@ def _predict_periods(
             f"{type(circuit).__name__}, whose response in time is not known, is predicted for "
             "whole periods"
         )
-    frequency = jnp.asarray(np.fft.rfftfreq(samples, 1 / rate)[1:])
-    predicted = np.full(recording.v_out.size, np.nan)
+    frequency = np.fft.rfftfreq(samples, 1 / rate)[1:]
     aligned = periodic_voltage(
         recording.v_th[:samples],
         np.roll(recording.v_out[:samples], -seen.lag),
         rate,
-        np.asarray(driver.source.response(frequency)),
-        np.asarray(circuit.response(frequency)),
+        driver.source.response(frequency),
+        circuit.response(frequency),
         float(driver.calibration.r_load[0]),
     )
-    predicted[:samples] = np.roll(aligned, seen.lag)
-    return predicted
+    xp, after = namespace(aligned), recording.v_out.size - samples
+    return xp.pad(xp.roll(aligned, seen.lag), (0, after), constant_values=np.nan)
 
 
+@array_function
+def fitted_voltage(
+    v_th: Float[np.ndarray, " time"],
+    v_out: Float[np.ndarray, " time"],
+    sample_rate: float,
+    feed: ContinuousDriver | MeasuredCurrent,
+    circuit: AbstractCircuit,
+) -> Float[AnyArray, " interval"]:
+    """Terminal voltage [V] with a load, fitted to an aligned record, without its edges.
+
+    The unknowns are the state at the start, the offset, the delay, and that of the calibration.
+
+    Args:
+        v_th: Unloaded voltage [V], or the measured current [A].
+        v_out: Loaded voltage [V].
+        sample_rate: Samples per second [Hz].
+        feed: The driver, or the measured current.
+        circuit: The load.
+    """
+    inputs, delayed = band_limited(v_th, WHOLE), shiftable(v_out, WHOLE)
+    load = circuit.impedance()
+    load = load.in_time(sample_rate, inputs.shape[0])
+    load = load if isinstance(load, StateSpace) else realise(load, sample_rate)
+    loop = feed.source.connected(load)
+    xp, states, system = namespace(loop.A, loop.C), loop.C.size, hold(loop, sample_rate)
+    forced = simulate(system, inputs, np.zeros(states))[0]
+    alone = StateSpace(system.A, np.zeros((states, 0)), system.C, np.zeros(0))
+    free = simulate(alone, np.zeros((forced.size, 0)), np.eye(states))[0]
+    known, late = [*free, xp.ones_like(forced)], None  # a measured current has no calibration
+    if isinstance(feed.source, SourceImpedance):
+        late = hold(_late(feed.source, load, loop, float(feed.r_known)), sample_rate)
+    degrees, powers = np.arange(1.0, inputs.shape[1]), np.arange(1.0, delayed.shape[1])
+    rates = np.pad(inputs[:, 1:] * degrees, ((0, 0), (0, 1)))  # per sample
+
+    def residual(q: Float[AnyArray, " q"]) -> Float[AnyArray, " interval"]:
+        linear = sum(of * by for of, by in zip(q[1:], columns, strict=True))
+        return forced + linear - xp.polyval(delayed[:, ::-1].T, -q[0])
+
+    # The residual is linear except in the delay, which is a small fraction of a sample, and in the
+    # state in the effect of a late calibration. This is that of the pass before: with a free state
+    # that decays within a sample, times this delay, the first sample could be any voltage.
+    q, columns = xp.zeros(1 + len(known) + (late is not None)), known
+    for _ in range(PASSES):
+        if late is not None:
+            flow = (loop.A @ q[1 : states + 1] + loop.B[:, 0] * inputs[0, 0]) / sample_rate
+            columns = [*known, simulate(late, rates, xp.pad(flow, (0, states)))[0]]
+        by_delay = xp.polyval((delayed[:, 1:] * powers)[:, ::-1].T, -q[0])
+        q = q - _solved(xp.stack([by_delay, *columns], axis=1), residual(q))
+    return residual(q) + delayed[:, 0]
+
+
+def _solved(
+    basis: Float[AnyArray, "row q"], rest: Float[AnyArray, " row"]
+) -> Float[AnyArray, " q"]:
+    """Least squares. A record may not determine all states of a ladder.
+
+    With B⁺ and what is left held, this has the derivative of B⁺ r (Golub and Pereyra 1973), also
+    where singular values are equal or 0.
+    """
+    inverse, q, left = _least_squares(basis, rest)
+    return q + inverse @ (rest - basis @ q) + inverse @ (inverse.T @ (basis.T @ left))
+
+
+@held
+def _least_squares(
+    basis: Float[AnyArray, "row q"], rest: Float[AnyArray, " row"]
+) -> tuple[Float[AnyArray, "q row"], Float[AnyArray, " q"], Float[AnyArray, " row"]]:
+    """B⁺, the solution, and what it leaves."""
+    inverse = namespace(basis).linalg.pinv(basis, rtol=EPS * rest.size)
+    q = inverse @ rest
+    return inverse, q, rest - basis @ q
+
+
+def _late(source: SourceImpedance, load: StateSpace, loop: StateSpace, r_load: float) -> StateSpace:
+    """From the rate of V_th to V_out by a late calibration; the delays of V_out belong to it too.
+
+    The voltage R_L I − V_out at the excess impedance acts as one more V_th.
+
+    Args:
+        source: The driver.
+        load: The load.
+        loop: Both, from V_th to V_out.
+        r_load: R_L, the resistor of the calibration [Ω].
+    """
+    xp, states, of_source = namespace(loop.A, loop.C), loop.C.size, source.state_space()
+    flow = r_load / (of_source.D + load.D)
+    C = -flow * xp.concatenate([of_source.C, load.C]) - loop.C
+    D = flow - loop.D
+    first, second = xp.pad(loop.A, ((0, 0), (0, states))), [loop.B * C, loop.A]
+    return StateSpace(
+        xp.concatenate([first, xp.concatenate(second, axis=1)]),
+        xp.concatenate([loop.B, loop.B * D]),
+        xp.concatenate([loop.C + loop.D * C, loop.C]),
+        loop.D + loop.D * D,
+    )
+
+
+@array_function
 def periodic_voltage(
     v_th: Float[np.ndarray, " time"],
     v_out: Float[np.ndarray, " time"],
     sample_rate: float,
-    z_th: Complex[np.ndarray, " frequency"],
-    z_load: Complex[np.ndarray, " frequency"],
+    z_th: Complex[AnyArray, " frequency"],
+    z_load: Complex[AnyArray, " frequency"],
     r_load: float,
-) -> Float[np.ndarray, " time"]:
+) -> Float[AnyArray, " time"]:
     """Terminal voltage [V] with a load, aligned with a record.
 
     The function fits the offset, the delay and the delay of the calibration. The delay of the
@@ -128,20 +226,22 @@ def periodic_voltage(
         z_load: Impedance of the load [Ω] at the same frequencies.
         r_load: Resistor of the calibration [Ω].
     """
-    f = np.fft.rfftfreq(v_th.size, 1 / sample_rate)[1:]
+    xp, f = namespace(z_th, z_load), np.fft.rfftfreq(v_th.size, 1 / sample_rate)[1:]
     samples = 2j * np.pi * f / sample_rate  # s times the sample interval
     x, y = np.fft.rfft(v_th)[1:], np.fft.rfft(v_out)[1:]
     excess = samples * (r_load - z_load)
     used = f < 0.4 * sample_rate  # above, anti-alias filters leave noise and aliases
-    own = late = 0.0
-    for _ in range(3):  # the first one leaves 1e-4 of two delays of 0.01 samples
-        total = z_load + z_th + late * excess
-        predicted = x * z_load / total * np.exp(-samples * own)
-        slopes = np.stack([-samples * predicted, -excess / total * predicted], axis=1)[used]
-        rest = (y - predicted)[used]
-        matrix = np.concatenate([slopes.real, slopes.imag])
-        step = np.linalg.lstsq(matrix, np.concatenate([rest.real, rest.imag]))[0]
-        own, late = own + step[0], late + step[1]
-    predicted = x * z_load / (z_load + z_th + late * excess) * np.exp(-samples * own)
+    delays = xp.zeros(2)
+
+    def predicted() -> Complex[AnyArray, " frequency"]:
+        own, late = delays
+        return x * z_load / (z_load + z_th + late * excess) * xp.exp(-samples * own)
+
+    for _ in range(PASSES):
+        reached = predicted()
+        by_late = -excess / (z_load + z_th + delays[1] * excess) * reached
+        slopes = xp.stack([-samples * reached, by_late], axis=1)[used]
+        matrix, rest = xp.concatenate([slopes.real, slopes.imag]), (y - reached)[used]
+        delays = delays + _solved(matrix, xp.concatenate([rest.real, rest.imag]))
     mean = v_out.sum()  # the coefficient of frequency 0: the offset is fitted
-    return np.fft.irfft(np.append(mean, predicted), v_th.size)
+    return xp.fft.irfft(xp.append(mean, predicted()), v_th.size)

@@ -344,12 +344,3 @@ def conjugate_gradients(
         return repeated(step, start, PRODUCTS).x
 
     return jax.lax.custom_linear_solve(product, b, solve, solve, symmetric=True)
-
-
-def in_turn(step: Callable[..., Any], state: Any, arguments: Sequence[AnyArray]) -> Any:
-    """Steps with each of the arguments: a loop of Python for NumPy, one of JAX for JAX."""
-    if namespace(*jax.tree.leaves((state, arguments))) is np:
-        for of in zip(*arguments, strict=True):
-            state = step(state, *of)
-        return state
-    return jax.lax.scan(lambda state, of: (step(state, *of), None), state, tuple(arguments))[0]

@@ -26,14 +26,13 @@ from etid.likelihood.linear import (
     NormalEquations,
     chosen,
     conjugate_gradients,
-    in_turn,
     inverse,
     replaced,
     taken,
 )
 from etid.likelihood.profile import Condensed, Profile, Records
 from etid.likelihood.shared import Unloaded
-from etid.precision import array_function, held, namespace
+from etid.precision import array_function, held, in_turn, namespace
 from etid.signals.knots import DENSITY, Knots, knots
 from etid.signals.transfer import AnyArray, as_complex, reciprocal
 

@@ -34,9 +34,8 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC, impedance_at
 from etid.likelihood.gains import VoltageAndCurrent
-from etid.likelihood.linear import in_turn
 from etid.likelihood.search import Load
-from etid.precision import array_function, held, namespace
+from etid.precision import array_function, held, in_turn, namespace
 from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex, power
 

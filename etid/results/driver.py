@@ -322,7 +322,7 @@ class ContinuousDriver(Driver):
         return cov + namespace(cov, std).diag(std**2)
 
     @property
-    def r_known(self) -> Float[Array, ""]:
+    def r_known(self) -> Float[AnyArray, ""]:
         """Resistor of the first calibration [Ω]."""
         return self.calibration.r_load[0]
 

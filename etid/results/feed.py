@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from etid.circuits.impedance import Quantity, realise
+from etid.circuits.impedance import Quantity, in_series, realise
 from etid.circuits.overview import Overview
 from etid.precision import Module, in_float64, namespace, untraced
 from etid.results.verdicts import RESULTS, Judged, verdict
@@ -126,22 +126,20 @@ class SourceImpedance(Module):
 
     def state_space(self) -> StateSpace:
         """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""
-        order = self.order
-        pairs = self.log_omega.shape[0]
-        omega, zeta = jnp.exp(self.log_omega), jnp.exp(self.log_zeta)
-        rate, zero = jnp.exp(self.log_omega_real), jnp.zeros(1, omega.dtype)
+        xp = namespace(self.log_resistance, self.log_omega, self.gain)
+        order, pairs = self.order, self.log_omega.shape[0]
+        omega, zeta = xp.exp(self.log_omega), xp.exp(self.log_zeta)
+        rate, zero = xp.exp(self.log_omega_real), xp.zeros(1, omega.dtype)
         # The elements of A, and where they are: several changes of a matrix of zeros are slower.
-        values = jnp.concatenate([zero, omega, -omega, -2 * zeta * omega, -rate])
+        values = xp.concatenate([zero, omega, -omega, -2 * zeta * omega, -rate])
         place, i, j = np.zeros((order, order), int), np.arange(pairs), np.arange(2 * pairs, order)
         place[2 * i, 2 * i + 1], place[2 * i + 1, 2 * i] = 1 + i, 1 + pairs + i
         place[2 * i + 1, 2 * i + 1], place[j, j] = 1 + 2 * pairs + i, 1 + pairs + j
-        A = jnp.take(values, place, mode="clip")
-        none = jnp.zeros_like(omega)
-        B = jnp.concatenate([jnp.stack([none, omega], axis=1).reshape(-1), rate])
-        C = jnp.concatenate(
-            [jnp.stack([self.gain, self.slope], axis=1).reshape(-1), self.gain_real]
-        )
-        return StateSpace(A, B[:, None], C, jnp.exp(self.log_resistance)[None])
+        A = xp.take(values, place, mode="clip")
+        none = xp.zeros_like(omega)
+        B = xp.concatenate([xp.stack([none, omega], axis=1).reshape(-1), rate])
+        C = xp.concatenate([xp.stack([self.gain, self.slope], axis=1).reshape(-1), self.gain_real])
+        return StateSpace(A, B[:, None], C, xp.exp(self.log_resistance)[None])
 
     def connected(self, load: StateSpace) -> StateSpace:
         """The system V_th → V_out with a load, from current [A] to voltage [V], at the terminal.
@@ -150,14 +148,11 @@ class SourceImpedance(Module):
         of the source, x₂ the states of the load.
         """
         z1, z2 = self.state_space(), load
+        xp, both = namespace(z1.A, z2.A), in_series(z1, z2)
         total = z1.D[0] + z2.D[0]
-        drop = jnp.concatenate([z1.C, z2.C])
-        B = jnp.concatenate([z1.B, z2.B]) / total
-        n1, n2 = z1.C.shape[0], z2.C.shape[0]
-        A = jnp.concatenate([jnp.pad(z1.A, ((0, 0), (0, n2))), jnp.pad(z2.A, ((0, 0), (n1, 0)))])
-        share = z2.D[0] / total
-        C = jnp.concatenate([jnp.zeros(n1), z2.C]) - share * drop
-        return StateSpace(A - B * drop[None, :], B, C, share[None])
+        B, share = both.B / total, z2.D[0] / total
+        C = xp.concatenate([np.zeros(z1.C.size), z2.C]) - share * both.C
+        return StateSpace(both.A - B * both.C[None, :], B, C, share[None])
 
 
 class CurrentSource(Module):
@@ -179,7 +174,7 @@ class CurrentSource(Module):
 def loaded(
     source: SourceImpedance | CurrentSource,
     load: Rational | StateSpace,
-    rate: float | Float[Array, ""],
+    rate: float | Float[AnyArray, ""],
 ) -> StateSpace:
     """The system input → V_out with `load` at the terminal, in continuous time."""
     return source.connected(load if isinstance(load, StateSpace) else realise(load, rate))
@@ -207,7 +202,7 @@ class MeasuredCurrent(AbstractFeed):
         return namespace(load).ones_like(load)
 
     @property
-    def r_known(self) -> Float[Array, ""]:
+    def r_known(self) -> Float[AnyArray, ""]:
         """Resistor of the calibration [Ω]; there is none."""
         return jnp.array(jnp.nan)
 

@@ -36,7 +36,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from etid.precision import Module, namespace
+from etid.precision import Module, in_turn, namespace
 from etid.signals.transfer import AnyArray
 
 BLOCK = 32  # samples; a larger block costs more in the Toeplitz product and less in the scan
@@ -48,57 +48,72 @@ DEGREE = 7  # degree of the interpolating polynomial inside one interval
 class StateSpace(Module):
     """A linear system; each function that takes one says whether it is continuous or discrete."""
 
-    A: Float[Array, "state state"]
-    B: Float[Array, "state input"]
-    C: Float[Array, " state"]
-    D: Float[Array, " input"]
+    A: Float[AnyArray, "state state"]
+    B: Float[AnyArray, "state input"]
+    C: Float[AnyArray, " state"]
+    D: Float[AnyArray, " input"]
 
 
 def simulate(
-    system: StateSpace, u: Float[Array, "time input"], x0: Float[Array, " state"]
-) -> tuple[Float[Array, " time"], Float[Array, " state"]]:
-    """Run the discrete recursion x[n+1] = A x[n] + B u[n], y[n] = C x[n] + D u[n]."""
-    time, inputs = u.shape
-    states = x0.shape[0]
-    blocks, rest = divmod(time, BLOCK)
-    A, B, C, D = system.A, system.B, system.C, system.D
+    system: StateSpace,
+    u: Float[AnyArray, "time input"],
+    x0: Float[AnyArray, "*row state"],
+) -> tuple[Float[AnyArray, "*row time"], Float[AnyArray, "*row state"]]:
+    """Run the discrete recursion x[n+1] = A x[n] + B u[n], y[n] = C x[n] + D u[n].
 
-    powers = jnp.eye(states, dtype=A.dtype)[None]  # A^0 … A^BLOCK by doubling
+    All rows of initial states have the same input.
+    """
+    A, B, C, D = system.A, system.B, system.C, system.D
+    xp, (time, inputs), states = namespace(A, B, C, D, u, x0), u.shape, C.shape[0]
+    x0 = xp.asarray(x0)
+    blocks, rest = divmod(time, BLOCK)
+
+    powers = xp.eye(states, dtype=A.dtype)[None]  # A^0 … A^BLOCK by doubling
     top = A
     while powers.shape[0] < BLOCK:
-        powers = jnp.concatenate([powers, powers @ top])
+        powers = xp.concatenate([powers, powers @ top])
         top = top @ top
-    observed = jnp.einsum("s,ksr->kr", C, powers)  # C A^k
-    impulse = jnp.concatenate([D[None], observed[:-1] @ B])  # h[0] = D, h[k] = C A^{k-1} B
+    observed = xp.einsum("s,ksr->kr", C, powers)  # C A^k
+    impulse = xp.concatenate([D[None], observed[:-1] @ B])  # h[0] = D, h[k] = C A^{k-1} B
     lag = np.arange(BLOCK)[:, None] - np.arange(BLOCK)[None, :]
-    impulse = jnp.pad(impulse, ((0, 1), (0, 0)))  # h[BLOCK] stands for h[k] with k < 0
-    toeplitz = jnp.take(impulse, np.where(lag >= 0, lag, BLOCK), axis=0, mode="clip")
-    reach = jnp.einsum("ksr,ri->ksi", powers[::-1], B)  # A^{BLOCK-1-k} B
+    impulse = xp.pad(impulse, ((0, 1), (0, 0)))  # h[BLOCK] stands for h[k] with k < 0
+    toeplitz = xp.take(impulse, np.where(lag >= 0, lag, BLOCK), axis=0, mode="clip")
+    reach = xp.einsum("ksr,ri->ksi", powers[::-1], B)  # A^{BLOCK-1-k} B
 
     whole = u[: blocks * BLOCK].reshape(blocks, BLOCK, inputs)
-    forced = jnp.einsum("ijm,bjm->bi", toeplitz, whole)
-    kicks = jnp.einsum("jsm,bjm->bs", reach, whole)
+    forced = xp.einsum("ijm,bjm->bi", toeplitz, whole)
+    kicks = xp.einsum("jsm,bjm->bs", reach, whole)
+    kicks = kicks.reshape(blocks, *[1] * (x0.ndim - 1), states)
 
-    starts, x = _carry(top, x0, kicks)
-    y = (forced + starts @ observed.T).reshape(-1)
+    starts, x = (_recur if xp is np else _carry)(top, x0, kicks)
+    free = xp.moveaxis(starts @ observed.T, 0, -2)
+    y = (forced + free).reshape(*x0.shape[:-1], -1)
     if rest:
         tail = u[blocks * BLOCK :]
-        y_tail = jnp.einsum("ijm,jm->i", toeplitz[:rest, :rest], tail) + observed[:rest] @ x
-        y = jnp.concatenate([y, y_tail])
-        x = powers[rest] @ x + jnp.einsum("jsm,jm->s", reach[BLOCK - rest :], tail)
+        y_tail = xp.einsum("ijm,jm->i", toeplitz[:rest, :rest], tail) + x @ observed[:rest].T
+        y = xp.concatenate([y, y_tail], -1)
+        x = x @ powers[rest].T + xp.einsum("jsm,jm->s", reach[BLOCK - rest :], tail)
     return y, x
 
 
 def _recur(
-    a: Float[Array, "state state"], x0: Float[Array, " state"], u: Float[Array, "time state"]
-) -> tuple[Float[Array, "time state"], Float[Array, " state"]]:
+    a: Float[AnyArray, "state state"],
+    x0: Float[AnyArray, "*row state"],
+    u: Float[AnyArray, "time *#row state"],
+) -> tuple[Float[AnyArray, "time *row state"], Float[AnyArray, "*row state"]]:
     """States of x[n+1] = a x[n] + u[n] before every step, and the state after the last step."""
+    if namespace(a, x0, u) is np:
+        states = np.empty((u.shape[0], *x0.shape))
+        for step, of in enumerate(u):
+            states[step] = x0
+            x0 = x0 @ a.T + of
+        return states, x0
 
     def advance(
-        x: Float[Array, " state"], u: Float[Array, " state"]
-    ) -> tuple[Float[Array, " state"], Float[Array, " state"]]:
+        x: Float[Array, "*row state"], u: Float[Array, "*#row state"]
+    ) -> tuple[Float[Array, "*row state"], Float[Array, "*row state"]]:
         # Not `a @ x`: for several x at once, such as derivatives, XLA calls a library each step.
-        return jnp.sum(a * x[None, :], axis=1) + u, x
+        return jnp.sum(a * x[..., None, :], axis=-1) + u, x
 
     x, states = jax.lax.scan(advance, x0, u)
     return states, x
@@ -106,8 +121,10 @@ def _recur(
 
 @jax.custom_jvp
 def _carry(
-    a: Float[Array, "state state"], x0: Float[Array, " state"], u: Float[Array, "time state"]
-) -> tuple[Float[Array, "time state"], Float[Array, " state"]]:
+    a: Float[Array, "state state"],
+    x0: Float[Array, "*row state"],
+    u: Float[Array, "time *#row state"],
+) -> tuple[Float[Array, "time *row state"], Float[Array, "*row state"]]:
     """`_recur` with its own derivative: the same recursion, driven by du + da x.
 
     The derivative that JAX makes forms da x step by step inside its scan. That costs six times as
@@ -188,8 +205,8 @@ def _interpolation_kernel(cutoff: float, earliest: float, degree: int) -> np.nda
 
 
 def band_limited(
-    v: Float[Array, " time"], cutoff: float = CUTOFF
-) -> Float[Array, "interval degree"]:
+    v: Float[AnyArray, " time"], cutoff: float = CUTOFF
+) -> Float[AnyArray, "interval degree"]:
     """Polynomial coefficients of the band-limited interpolation of `v` in every interval.
 
     Row i belongs to the interval that starts at sample `TAPS − 1 + i`. There is a row for each
@@ -203,7 +220,9 @@ def band_limited(
     return _interpolate(v, _interpolation_kernel(cutoff, 0.0, DEGREE))
 
 
-def shiftable(v: Float[Array, " time"], cutoff: float = CUTOFF) -> Float[Array, "interval degree"]:
+def shiftable(
+    v: Float[AnyArray, " time"], cutoff: float = CUTOFF
+) -> Float[AnyArray, "interval degree"]:
     """Polynomial coefficients of every sample as a function of a time shift τ.
 
     v((n + τ) / fs) = Σ_k c_k[n] τ^k for −1 ≤ τ ≤ 1. The rows are those of `band_limited`.
@@ -215,52 +234,49 @@ def shiftable(v: Float[Array, " time"], cutoff: float = CUTOFF) -> Float[Array, 
     return _interpolate(v, _interpolation_kernel(cutoff, -1.0, 10))  # it spans two intervals
 
 
-def _interpolate(v: Float[Array, " time"], weights: np.ndarray) -> Float[Array, "interval degree"]:
-    kernel = jnp.asarray(weights, v.dtype)
-    rows = v.shape[0] - 2 * TAPS + 1
-    neighbours = jnp.stack([jax.lax.slice_in_dim(v, j, j + rows) for j in range(2 * TAPS)])
-    return jnp.einsum("jt,jk->tk", neighbours, kernel)
+def _interpolate(
+    v: Float[AnyArray, " time"], weights: Float[np.ndarray, "tap degree"]
+) -> Float[AnyArray, "interval degree"]:
+    xp, rows = namespace(v), v.shape[0] - 2 * TAPS + 1
+    neighbours = xp.stack([v[j : j + rows] for j in range(2 * TAPS)])
+    return neighbours.T @ xp.asarray(weights, v.dtype)
 
 
-def _expm(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def _expm(matrix: Float[AnyArray, "n n"]) -> Float[AnyArray, "n n"]:
     """Matrix exponential by a Taylor series of the scaled matrix and repeated squaring.
 
     `jax.scipy.linalg.expm` compiles a solver for each of its five Padé orders. It compiles three
-    times as long as this function, and an identification compiles it at a dozen places.
+    times as long as this function.
     """
-    norm = jax.lax.stop_gradient(jnp.abs(matrix).sum(0).max())
+    xp = namespace(matrix)
+    norm = xp.abs(matrix).sum(0).max()
     # At a norm of 0.2, the eleventh term of the series is 1e-16.
-    squarings = jnp.ceil(jnp.log2(jnp.maximum(norm / 0.2, 1.0)))
-    unit = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-    small = matrix * jnp.exp2(-squarings)
+    squarings = xp.ceil(xp.log2(xp.maximum(norm / 0.2, 1.0)))
+    unit = xp.eye(matrix.shape[0], dtype=matrix.dtype)
+    small = matrix * xp.exp2(-squarings)
 
     # Horner's rule for e^M − 1 instead of e^M, so that terms much smaller than 1 are not lost.
-    def term(total: Float[Array, "n n"], k: Float[Array, ""]) -> tuple[Float[Array, "n n"], None]:
-        return small @ (unit + total) / k, None
+    def term(total: Float[AnyArray, "n n"], k: AnyArray) -> Float[AnyArray, "n n"]:
+        return small @ (unit + total) / k
 
-    def square(total: Float[Array, "n n"], k: Float[Array, ""]) -> tuple[Float[Array, "n n"], None]:
-        def squared(total: Float[Array, "n n"]) -> Float[Array, "n n"]:
-            return 2 * total + total @ total
+    def square(total: Float[AnyArray, "n n"], k: AnyArray) -> Float[AnyArray, "n n"]:
+        return xp.where(k < squarings, 2 * total + total @ total, total)
 
-        return jax.lax.cond(k < squarings, squared, lambda total: total, total), None
-
-    orders = jnp.arange(10, 0, -1, dtype=matrix.dtype)
-    total, _ = jax.lax.scan(term, jnp.zeros_like(matrix), orders)
-    total, _ = jax.lax.scan(square, total, jnp.arange(32, dtype=matrix.dtype))
-    return unit + total
+    orders = np.arange(10, 0, -1, dtype=matrix.dtype)
+    total = in_turn(term, xp.zeros_like(matrix), [orders])
+    return unit + in_turn(square, total, [np.arange(32, dtype=matrix.dtype)])
 
 
-def hold(system: StateSpace, sample_rate: float | Float[Array, ""]) -> StateSpace:
+def hold(system: StateSpace, sample_rate: float | Float[AnyArray, ""]) -> StateSpace:
     """Discretise a single-input continuous system for inputs given by `band_limited`."""
-    states = system.A.shape[0]
-    both = jnp.concatenate([system.A, system.B], axis=1) / sample_rate
-    chain = jnp.eye(DEGREE + 1, states + DEGREE + 1, k=states + 1, dtype=both.dtype)
-    exponential = _expm(jnp.concatenate([jnp.pad(both, ((0, 0), (0, DEGREE))), chain]))
-    factorials = jnp.array([math.factorial(k) for k in range(DEGREE + 1)], system.A.dtype)
-    feedthrough = jnp.pad(system.D, (0, DEGREE))
+    xp, states = namespace(system.A, system.B, sample_rate), system.A.shape[0]
+    both = xp.concatenate([system.A, system.B], axis=1) / sample_rate
+    chain = xp.eye(DEGREE + 1, states + DEGREE + 1, k=states + 1, dtype=both.dtype)
+    exponential = _expm(xp.concatenate([xp.pad(both, ((0, 0), (0, DEGREE))), chain]))
+    factorials = np.array([math.factorial(k) for k in range(DEGREE + 1)], system.A.dtype)
     return StateSpace(
         A=exponential[:states, :states],
         B=exponential[:states, states:] * factorials[None, :],
         C=system.C,
-        D=feedthrough,
+        D=xp.pad(system.D, (0, DEGREE)),
     )

@@ -333,37 +333,3 @@ def _support(objective: Float[Array, ""], records: Records, elements: int) -> Su
         jnp.zeros(elements),
         jnp.asarray(jnp.nan),
     )
-
-
-def fitted_voltage(
-    records: Records,
-    source: SourceImpedance | CurrentSource,
-    r_load: Float[Array, ""],
-    load: Rational | StateSpace,
-) -> Float[Array, " interval"]:
-    """Terminal voltage with `load` [V], fitted to a record.
-
-    The fit has the initial state, offset, delay, and delay of the calibration with `r_load` [Ω].
-    """
-    system = loaded_filter(source, load, records.sample_rate)
-    zero = jnp.zeros(())
-    q, named = ravel_pytree((Nuisance(jnp.zeros_like(system.C), zero, zero), zero))
-
-    def residual(
-        q: Float[Array, " q"], late: Float[Array, " interval"]
-    ) -> Float[Array, " interval"]:
-        nuisance, late_samples = named(q)
-        predicted = predict(system, records, nuisance) + late_samples * late
-        return predicted - measured(records, nuisance.delay_samples)
-
-    # The residual is linear except in the delay, which is a small fraction of a sample, and in the
-    # state in `late`. `late` uses the state of the previous step: with a free state that decays
-    # within a sample, times the delay of the calibration, the first sample could be any voltage.
-    def again(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        q, _ = state
-        late = late_calibration(records, source, load, r_load, named(q)[0].state).v_out
-        basis = jax.jacfwd(residual)(q, late)
-        return q - jnp.linalg.lstsq(basis, residual(q, late))[0], late
-
-    q, late = jax.lax.fori_loop(0, PASSES, again, (q, jnp.zeros_like(records.v_out[:, 0])))
-    return residual(q, late) + records.v_out[:, 0]
