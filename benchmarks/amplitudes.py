@@ -25,9 +25,10 @@ import etid
 from benchmarks.machine import timed
 from benchmarks.rivals import RivalError, exchange
 from benchmarks.runner import Target, at_most, report
-from etid.circuits.current_dependent import Norton, Signals, port
+from etid.circuits.circuit import impedance_tree
+from etid.nonlinear.balance import steady_state, to_harmonics, to_time
+from etid.nonlinear.port import port
 from etid.signals.transfer import as_complex, frequency_variable
-from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
 
 PULSE_RATE = 60.0  # Hz
 SAMPLES = 3334  # of a period, at 200 kHz
@@ -148,20 +149,20 @@ def balanced(
     frequency = jnp.arange(points // 2 + 1.0).at[0].set(1e-6) * PULSE_RATE
     s = frequency_variable(frequency)
     if case.v_th is None:
-        feed = Norton(to_harmonics(jnp.asarray(pulses(t))), jnp.zeros_like(s))
+        source, admittance = to_harmonics(jnp.asarray(pulses(t))), jnp.zeros_like(s)
     else:
         z_th = RESISTANCE + INDUCTANCE * s
         v_th = jnp.pad(jnp.asarray(case.v_th), (0, s.size - case.v_th.size))
-        feed = Norton(v_th / z_th, 1 / z_th)
+        source, admittance = v_th / z_th, 1 / z_th
 
     def predicted(logs: Float[Array, " element"]) -> Float[Array, " sample"]:
-        at = port(case.skin.with_log_values(logs).impedance(), feed, s)
-        r = as_complex(jnp.asarray(at.element.r))
-        small = at.source.current / (1 + at.source.admittance * r)
+        at = port(impedance_tree(case.skin, logs), admittance, s)
+        j = at.share * source
+        small = j / (1 + at.admittance * as_complex(jnp.asarray(at.element.r)))
         size = jnp.max(jnp.abs(to_time(small, points)))
         slope = at.element.typical_slope(2 * size)
-        signals = Signals(*steady_state(at.element.current, slope, *at.source))
-        return to_time(at.outwards(signals).voltage, points)[::finer]
+        u, i = steady_state(at.element, slope, j, at.admittance).signals()
+        return to_time(at.voltage[0] * u + at.voltage[1] * i, points)[::finer]
 
     return predicted
 

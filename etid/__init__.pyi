@@ -32,7 +32,6 @@ from .files.exporting import export_study as export_study
 from .files.folder import import_folder as import_folder
 from .files.importing import import_file as import_file
 from .files.spectra import read_impedance as read_impedance
-from .identify.amplitudes import identify_amplitudes as identify_amplitudes
 from .identify.driver import identify_driver as identify_driver
 from .identify.file import fit_file as fit_file
 from .identify.impedance import identify_impedance as identify_impedance
@@ -45,6 +44,7 @@ from .identify.skins import identify_skin as identify_skin
 from .identify.skins import identify_skins as identify_skins
 from .identify.skins import select_circuit as select_circuit
 from .identify.study import identify_study as identify_study
+from .nonlinear.identify import identify_amplitudes as identify_amplitudes
 from .online.controller import Controller as Controller
 from .online.tracker import Tracker as Tracker
 from .plotting import plot as plot

@@ -4,6 +4,7 @@ The truth is a differential equation of the skin under a current source, solved 
 in time; harmonic balance and fits know nothing of it.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,20 +15,22 @@ from scipy.special import erf
 
 import etid
 from benchmarks import amplitudes as amplitudes_benchmark
-from etid.circuits.current_dependent import Norton, Signals, port
-from etid.estimators.amplitudes.fit import _equations
-from etid.estimators.amplitudes.terms import Amplitudes, with_filter
+from etid.circuits.circuit import impedance_tree
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import source_of
-from etid.identify.amplitudes import leaves_much
-from etid.numpy_tier import tiers
+from etid.nonlinear.amplitudes import Amplitudes
+from etid.nonlinear.balance import steady_state, to_harmonics, to_time
+from etid.nonlinear.identify import leaves_much
+from etid.nonlinear.port import port
+from etid.nonlinear.response import Recorded, with_filter
+from etid.precision import array_function
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.results.driver import HarmonicDriver
 from etid.results.feed import SourceImpedance
-from etid.signals.harmonics import Spectrum
+from etid.signals.harmonics import Spectrum, real_parts
 from etid.signals.transfer import frequency_variable
-from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
+from tests import kept_numbers
 
 POINTS = 8192  # of a period of harmonic balance
 SAMPLE_RATE, PULSE_RATE = 200e3, 60.0
@@ -37,15 +40,6 @@ SLOW_RATE, SLOWER = 20e3, 8
 HARMONICS = 116  # up to 0.35 of the slow rate
 AT = np.arange(1000) / SLOW_RATE % (1 / PULSE_RATE) / SLOWER
 SKIN = etid.SkinCurrent(r_s=895.0, r_p=60.1e3, c_p=1e-9, i_0=0.585e-3)  # Kaczmarek and Webster 1989
-
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
-
-@pytest.fixture
-def compiled(monkeypatch):
-    """One program for dozens of fits: by all passes of XLA, each takes a sixth of the time."""
-    monkeypatch.setattr(tiers, "_by_numpy", lambda: False)
-    monkeypatch.setattr(tiers, "AT_ONCE", {})
 
 
 def pulses(t: np.ndarray) -> np.ndarray:
@@ -85,37 +79,61 @@ def recorded(v_out: np.ndarray, current: np.ndarray, level: float, rng, rate: fl
     )
 
 
+@array_function
+def response(xp, logs, source, admittance, frequency):
+    """Voltage and current of skin at its terminals, for an R near that of its slopes."""
+    at = port(impedance_tree(SKIN, logs), admittance, frequency_variable(frequency))
+    slope = at.element.typical_slope(xp.asarray(1e-3))
+    u, i = steady_state(at.element, slope, source * at.share, at.admittance).signals()
+    return (of[0] * u + of[1] * i for of in (at.voltage, at.current))
+
+
+def harmonics(points: int) -> np.ndarray:
+    frequency = np.arange(points // 2 + 1.0)
+    frequency[0] = 1e-6
+    return frequency * PULSE_RATE
+
+
 def test_harmonic_balance_agrees_with_steps_in_time():
-    points = POINTS
-    t = np.arange(points) / points / PULSE_RATE
-    frequency = jnp.arange(points // 2 + 1.0).at[0].set(1e-6) * PULSE_RATE
-    source = Norton(to_harmonics(jnp.asarray(1e-3 * pulses(t))), jnp.zeros(frequency.size, complex))
-    at = port(SKIN.impedance(), source, frequency_variable(frequency))
-    balance = steady_state(
-        at.element.current, at.element.typical_slope(jnp.array(1e-3)), *at.source
-    )
-    v = to_time(at.outwards(Signals(*balance)).voltage, points)
+    t, f = np.arange(POINTS) / POINTS / PULSE_RATE, harmonics(POINTS)
+    source = to_harmonics(1e-3 * pulses(t))
+    voltage, _ = response(np, np.log(SKIN.values()), source, np.zeros(f.size, complex), f)
     exact = stepped(1e-3, t)
     # 1e-5 of the peak: u(i) bends within 8 µs, four points of the grid, so harmonics are cut off.
-    np.testing.assert_allclose(v, exact, atol=1e-5 * np.abs(exact).max())
+    np.testing.assert_allclose(to_time(voltage, POINTS), exact, atol=1e-5 * np.abs(exact).max())
 
 
 def test_a_large_i_0_is_a_linear_load():
-    frequency = jnp.arange(POINTS // 2 + 1.0).at[0].set(1e-6) * PULSE_RATE
-    s = frequency_variable(frequency)
-    z_th = 12e3 + 0.1 * s
-    v_th = jnp.asarray(pulses(np.arange(POINTS) / POINTS / PULSE_RATE))
-    source = Norton(to_harmonics(v_th) / z_th, 1 / z_th)
-    skin = etid.SkinCurrent(r_s=20e3, r_p=100e3, c_p=0.3e-9, i_0=1e6)
-    at = port(skin.impedance(), source, s)
-    balance = steady_state(at.element.current, jnp.array(100e3), *at.source)
-    signals = at.outwards(Signals(*balance))
-    z = etid.SkinRC(r_s=20e3, r_p=100e3, c_p=0.3e-9).response(frequency)
-    linear = source.current * z / (1 + source.admittance * z)
+    f = harmonics(POINTS)
+    z_th = 12e3 + 0.1 * frequency_variable(f)
+    v_th = to_harmonics(pulses(np.arange(POINTS) / POINTS / PULSE_RATE))
+    logs = np.log([20e3, 100e3, 0.3e-9, 1e6])
+    voltage, current = response(np, logs, v_th / z_th, 1 / z_th, f)
+    z = etid.SkinRC(r_s=20e3, r_p=100e3, c_p=0.3e-9).response(f)
+    linear = v_th * z / (z + z_th)
     # 1e-7: the tolerance of the balance is 1e-8 of the largest value
-    peak = np.abs(np.asarray(linear)).max()
-    np.testing.assert_allclose(signals.voltage, linear, atol=1e-7 * peak)
-    np.testing.assert_allclose(signals.current * z, linear, atol=1e-7 * peak)
+    peak = np.abs(linear).max()
+    np.testing.assert_allclose(voltage, linear, atol=1e-7 * peak)
+    np.testing.assert_allclose(current * z, linear, atol=1e-7 * peak)
+
+
+def test_jax_has_the_same_response_and_its_derivatives():
+    points = 1024  # few, so that differences of a large number of them are no part of the time
+    f, t = harmonics(points), np.arange(points) / points / PULSE_RATE / SLOWER
+    source, none = to_harmonics(1e-3 * pulses(t)), np.zeros(f.size, complex)
+    logs = np.log(SKIN.values())
+
+    def size(xp, logs):
+        voltage, _ = response(xp, logs, xp.asarray(source), xp.asarray(none), f)
+        return (voltage * xp.conj(voltage)).real.sum()
+
+    slope = jax.jit(jax.grad(lambda logs: size(jnp, logs)))(logs)
+    along = jax.jit(jax.jacfwd(lambda logs: size(jnp, logs)))(logs)
+    ways = 1e-3 * np.eye(4)  # leaves 1e-6 of the third derivative, and 1e-8 / 1e-3 of a balance
+    numeric = [(size(np, logs + way) - size(np, logs - way)) / 2e-3 for way in ways]
+    np.testing.assert_allclose(size(jnp, jnp.asarray(logs)), size(np, logs), rtol=1e-6)
+    for found in (slope, along):
+        np.testing.assert_allclose(found, numeric, atol=1e-3 * np.abs(numeric).max())
 
 
 def behind_a_driver(amplitude: float, elements: np.ndarray) -> np.ndarray:
@@ -161,25 +179,21 @@ def test_terms_and_their_slopes_agree_with_steps_in_time():
     y, ones = outputs(truth), np.ones((2, HARMONICS))
     unit = coefficients(pulses(np.arange(2048) / 2048 / PULSE_RATE / SLOWER))
     x, used = amplitudes[:, None] * passed * unit, f * ones < 5e3
-    none = jnp.zeros(0)
+    none = np.zeros(0)
     feed = object.__new__(HarmonicDriver)  # only its source is read
-    r_th, g, omega = jnp.log(12e3), jnp.array([20e3]), jnp.log(jnp.array([1 / 0.2e-3]))
-    source = SourceImpedance(r_th, none, none, none, none, omega, g)
+    r_th, g, omega = np.log(12e3), np.array([20e3]), np.log(np.array([1 / 0.2e-3]))
+    source = SourceImpedance(np.asarray(r_th), none, none, none, none, omega, g)
     object.__setattr__(feed, "source", source)
-    known = source_of(GivenDriver.measured(jnp.asarray(f)))
-    loaded = jnp.asarray(source.response(f)) + 50e3
-    known = known._replace(loaded=loaded, resistance=jnp.array(50e3))
-    of = Amplitudes(
-        given=with_filter(known),
-        feed=feed,
-        circuit=etid.SkinCurrent(),
-        spectra=Spectrum(*map(jnp.asarray, (f * ones, x, y, ones, ones, used))),
-        sample_rate=jnp.array(SLOW_RATE),
-        expected=jnp.asarray(0.08 * ones),
-    )
+    known = source_of(jax.tree.map(np.asarray, GivenDriver.measured(jnp.asarray(f))))
+    loaded = source.response(f) + 50e3
+    known = known._replace(loaded=loaded, resistance=np.array(50e3))
+    recorded = Recorded(with_filter(known), feed, etid.SkinCurrent(), f * ones, SLOW_RATE)
+    spectra = Spectrum(f * ones, x, y, ones, ones, used)
+    of = Amplitudes(recorded, spectra, expected=0.08 * ones)
     filters = np.array([0.0, 1.2 * np.arctanh(1 / 1.2)])  # the second one alone
-    q = jnp.asarray(np.concatenate([np.log(truth), delays, filters]))
-    predicted, slopes = map(np.asarray, tiers.program(of.slopes)(q))
+    q = np.concatenate([np.log(truth), delays, filters])
+    at = of.at(q)
+    predicted, slopes = at.predicted, np.moveaxis(of.by_q(at.slopes()), 0, 1)
     peak = np.abs(y).max(axis=1, keepdims=True)
     # The balance has no harmonics beyond 14 kHz.
     np.testing.assert_allclose(predicted / peak, y / peak, atol=1e-5)
@@ -192,25 +206,38 @@ def test_terms_and_their_slopes_agree_with_steps_in_time():
     np.testing.assert_allclose(slopes[:, 4:6], by_delay, atol=1e-12)
     # 5 is 1/σ of a part with half the variance; I_0 has a prior of its own.
     off = 5 * used * (y - 0.9 * predicted)
-    found = of.scaled(jnp.asarray(0.9 * predicted))
-    np.testing.assert_allclose(found, np.concatenate([off.real, off.imag], axis=1), atol=1e-12)
+    np.testing.assert_allclose(of.terms(0.9 * predicted), off, atol=1e-12)
     away = np.array([0.0, 0.0, 0.0, np.log(truth[3] / 0.585e-3) / 5, *(delays / 0.5), *filters])
     np.testing.assert_allclose(of.priors(q), away, atol=1e-12)
-    found = tiers.program(lambda q: _equations(None, q, of))(q)
-    part, rows = np.asarray(of.scaled(jnp.asarray(predicted))), 5 * used[:, None] * slopes
+    found = of.equations(q[None])
+    part, rows = real_parts(of.terms(predicted)), 5 * used[:, None] * slopes
     rows = np.concatenate([rows.real, rows.imag], axis=2)
-    prior = 1 / np.asarray(of.widths(q))
+    prior = 1 / of.width
     np.testing.assert_allclose(found.objective, 0.5 * (np.sum(part**2) + np.sum(away**2)))
+    np.testing.assert_allclose(of.objective(q[None]), found.objective)
     gradient, size = prior * away - np.einsum("rqt,rt->q", rows, part), np.abs(rows).max()
-    np.testing.assert_allclose(found.gradient, gradient, atol=1e-9 * size)
+    np.testing.assert_allclose(found.gradient[0], gradient, atol=1e-9 * size)
     matrix = np.diag(prior**2) + np.einsum("rqt,rpt->qp", rows, rows)
-    np.testing.assert_allclose(found.matrix, matrix, rtol=1e-9, atol=1e-12 * size**2)
+    np.testing.assert_allclose(found.matrix[0], matrix, rtol=1e-9, atol=1e-12 * size**2)
+    # The effect of a small change of X, and its transpose.
+    rng = np.random.default_rng(2)
+    change, other = (one + 1j * two for one, two in rng.standard_normal((2, 2, *x.shape)))
+    effect = at.along(change)
+    step = 1e-4 * peak
+    ends = (recorded.at(of.own(q), x + sign * step * change).predicted for sign in (1, -1))
+    numeric = np.subtract(*ends) / (2 * step)
+    largest = np.abs(effect).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(effect / largest, numeric / largest, atol=1e-3)
+    pairs = (effect, other), (change, at.back(other))
+    left, right = (np.sum(np.real(one.conj() * another)) for one, another in pairs)
+    np.testing.assert_allclose(left, right, rtol=1e-3)
 
 
 def test_two_amplitudes_tell_the_elements_and_their_fall():
     truth, rng = np.array([895.0, 60.1e3, SLOWER * 1e-9, 0.585e-3]), np.random.default_rng(1)
     exact = [(stepped(one, AT), one * pulses(AT)) for one in (0.5e-3, 5e-3)]
     fit = etid.identify_amplitudes([recorded(*one, 1e-3, rng) for one in exact])
+    kept_numbers.check("several_amplitudes", kept_numbers.of_fit(fit))
     error = np.asarray(fit.circuit.values()) - truth
     assert np.abs(error / truth).max() < 0.02
     # Chi-squared with four degrees of freedom, exceeded once in ten thousand times.
@@ -218,7 +245,7 @@ def test_two_amplitudes_tell_the_elements_and_their_fall():
 
 
 @pytest.mark.slow
-def test_elements_and_errors_are_right_at_any_amplitudes(compiled):
+def test_elements_and_errors_are_right_at_any_amplitudes():
     """At 1, 3 and 5 mA the resistance is far below R_p in every record."""
     truth, draws = np.array([895.0, 60.1e3, SLOWER * 1e-9, 0.585e-3]), 6
     distance = []
@@ -280,7 +307,7 @@ def second(amplitude: float, t: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_linear_skin_is_called_nonlinear_as_rarely_as_stated(compiled, monkeypatch):
+def test_linear_skin_is_called_nonlinear_as_rarely_as_stated(monkeypatch):
     """1 of 2 000 by the limit; of 100, more than one would come by chance once in 800 times."""
     amplitudes = (1e-4, 5e-4, 5e-4)
     exact = [(linear(one, AT), one * pulses(AT)) for one in amplitudes]
@@ -310,7 +337,7 @@ def test_linear_skin_is_called_nonlinear_as_rarely_as_stated(compiled, monkeypat
         ((linear, second), 60.0, False),
     ],
 )
-def test_slow_recovery_is_told_from_other_misfits(truth, snr_db, fits, compiled):
+def test_slow_recovery_is_told_from_other_misfits(truth, snr_db, fits):
     for amplitudes in ((0.1e-3, 0.3e-3, 1e-3), (1e-3, 3e-3, 5e-3)):
         rng, level = np.random.default_rng(round(snr_db)), 10 ** (-snr_db / 20)
         of = [
@@ -385,4 +412,4 @@ def test_skin_that_falls_with_its_current_is_identified_behind_a_driver(corner):
 )
 def test_a_small_chi2_excuses_no_large_residual(chi2, rrse, much):
     """At a large gain the noise of V_th would explain any residual."""
-    assert bool(leaves_much(jnp.array(chi2), jnp.array(rrse))) is much
+    assert leaves_much(chi2, rrse) is much

@@ -129,7 +129,6 @@ def test_what_an_estimate_shows_beside_its_elements_are_remarks():
     names = {
         "hum": Remark.mains_hum,
         "falls": Remark.falls_with_current,
-        "late": Remark.follows_late,
         "doubtful": Remark.gain_doubtful,
     }
     for seen in itertools.product([True, False], repeat=len(names)):

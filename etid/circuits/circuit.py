@@ -235,8 +235,7 @@ def impedance_at(
     frequency: Float[AnyArray, "*#row band"],
 ) -> Complex[AnyArray, "*row band"]:
     """Z [Ω] of a circuit whose elements have these logarithms, in the namespace of the arrays."""
-    xp = namespace(logs, frequency)
-    tree = _tree(type(circuit), _by_element(xp.exp(logs)))
+    xp, tree = namespace(logs, frequency), impedance_tree(circuit, logs)
     shape = (*logs.shape[:-1], frequency.shape[-1])
     return _as_rows(xp, tree(frequency_variable(widened(frequency, len(shape)))), shape)
 
@@ -307,6 +306,13 @@ def too_steep(
     slope = xp.stack(slopes, -1)
     error = xp.sqrt(((slope @ cov) * slope).sum(-1))
     return (alphas(logs) - 1 > STEEP * error).any(-1)
+
+
+def impedance_tree(
+    circuit: AbstractCircuit, logs: Float[AnyArray, "*row element"]
+) -> AbstractImpedance:
+    """The tree of elements with these logarithms, which have an axis of one for frequencies."""
+    return _tree(type(circuit), _by_element(namespace(logs).exp(logs)))
 
 
 def _tree(kind: type[AbstractCircuit], values: Sequence[AnyArray]) -> AbstractImpedance:

@@ -1,4 +1,4 @@
-"""A resistor that falls with its current, and what the rest of a circuit is for it.
+"""A resistor that falls with its current.
 
 Skin conducts better the more current flows. Kaczmarek and Webster (1989, "Voltage-current
 characteristics of the electrotactile skin-electrode interface", Proc. IEEE EMBS 11) measured a
@@ -7,28 +7,22 @@ fall of the resistance to a thirtieth up to 25 mA:
     R(i) = 895 Ω + 60.1 kΩ ‖ (60.1 kΩ · 0.585 mA / |i|) = R_s + R_p / (1 + |i| / I_0).
 """
 
-import operator
-from collections.abc import Callable
-from functools import reduce
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
-import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float, Inexact
+from jaxtyping import Complex, Float, Inexact
 
 from etid.circuits.circuit import AbstractCircuit, parameter
 from etid.circuits.elements import Farad, Ohm, Resistance, capacitor, resistor
 from etid.circuits.impedance import (
     AbstractImpedance,
     Netlist,
-    Parallel,
     Quantity,
-    Series,
     Slopes,
     parallel,
     series,
 )
 from etid.precision import namespace
-from etid.signals.transfer import AnyArray, reciprocal
+from etid.signals.transfer import AnyArray
 
 Ampere = Quantity
 
@@ -40,19 +34,24 @@ class CurrentDependentResistance(Resistance):
     i_0: Ampere
 
     def current(
-        self, wave: Float[Array, " time"], resistance: Float[Array, ""]
-    ) -> Float[Array, " time"]:
+        self, wave: Float[AnyArray, "..."], resistance: Float[AnyArray, "..."]
+    ) -> Float[AnyArray, "..."]:
         """The current i [A] at which u(i) + R′ i is the given wave, with the voltage u(i) [V]."""
-        size, r, i_0 = jnp.abs(wave), jnp.asarray(self.r), jnp.asarray(self.i_0)
-        half = r + resistance - size / i_0
-        root = jnp.sqrt(half**2 + 4 * resistance * size / i_0)
+        xp, i_0 = namespace(wave, self.r, self.i_0, resistance), self.i_0
+        size = xp.abs(wave)
+        half = self.r + resistance - size / i_0
+        root = xp.sqrt(half**2 + 4 * resistance * size / i_0)
         rising = half > 0  # of the two forms of the root of a quadratic, the one without a loss
-        small = 2 * size / (jnp.where(rising, half, 0.0) + root)
-        return jnp.sign(wave) * jnp.where(rising, small, (root - half) * i_0 / (2 * resistance))
+        small = 2 * size / (xp.where(rising, half, 0.0) + root)
+        return xp.sign(wave) * xp.where(rising, small, (root - half) * i_0 / (2 * resistance))
 
-    def typical_slope(self, size: Float[Array, ""]) -> Float[Array, ""]:
+    def slope(self, current: Float[AnyArray, "..."]) -> Float[AnyArray, "..."]:
+        """u′ [Ω] at a current [A]."""
+        return self.r / (1 + namespace(current).abs(current) / self.i_0) ** 2
+
+    def typical_slope(self, size: Float[AnyArray, "..."]) -> Float[AnyArray, "..."]:
         """Geometric mean of the smallest and the largest slope u′ [Ω] for currents up to `size`."""
-        return jnp.asarray(self.r) / (1 + size / jnp.asarray(self.i_0))
+        return self.r / (1 + size / self.i_0)
 
     def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
         """Those at small currents, where I_0 has no effect."""
@@ -112,44 +111,6 @@ class SkinCurrent(AbstractCircuit):
         )
 
 
-class Norton(NamedTuple):
-    """A source with its admittance, at each frequency.
-
-    Attributes:
-        current: Short-circuit current J [A].
-        admittance: Y [S].
-    """
-
-    current: Complex[Array, " frequency"]
-    admittance: Complex[Array, " frequency"]
-
-
-class Signals(NamedTuple):
-    """Voltage and current of a part at each frequency.
-
-    Attributes:
-        voltage: Voltage across the part [V].
-        current: Current into the part [A].
-    """
-
-    voltage: Complex[Array, " frequency"]
-    current: Complex[Array, " frequency"]
-
-
-class Port(NamedTuple):
-    """A source as the current-dependent resistor of a circuit sees it.
-
-    Attributes:
-        element: The resistor.
-        source: The source together with the rest of the circuit.
-        outwards: Signals at the terminals of the circuit, from those of the resistor.
-    """
-
-    element: CurrentDependentResistance
-    source: Norton
-    outwards: Callable[[Signals], Signals]
-
-
 def current_dependent(impedance: AbstractImpedance) -> CurrentDependentResistance | None:
     """The resistor of a circuit that depends on its current; None if there is none."""
     found = [one for one in impedance.elements() if isinstance(one, CurrentDependentResistance)]
@@ -158,31 +119,3 @@ def current_dependent(impedance: AbstractImpedance) -> CurrentDependentResistanc
             f"a circuit has {len(found)} resistors that depend on their current; use one"
         )
     return found[0] if found else None
-
-
-def port(impedance: AbstractImpedance, source: Norton, s: Complex[Array, " frequency"]) -> Port:
-    """The source behind everything between it and the resistor that depends on its current."""
-    if isinstance(impedance, CurrentDependentResistance):
-        return Port(impedance, source, lambda signals: signals)
-    assert isinstance(impedance, Series | Parallel)
-    inner = [part for part in impedance.parts if current_dependent(part) is not None]
-    others = [part for part in impedance.parts if part is not inner[0]]
-    if isinstance(impedance, Series):
-        z = reduce(operator.add, [part(s) for part in others], namespace(s).zeros_like(s))
-        loss = reciprocal(1 + source.admittance * z)
-        found = port(inner[0], Norton(source.current * loss, source.admittance * loss), s)
-
-        def outwards(signals: Signals) -> Signals:
-            voltage, current = found.outwards(signals)
-            return Signals(voltage + z * current, current)
-    else:
-        y = reduce(
-            operator.add, [part.admittance(s) for part in others], namespace(s).zeros_like(s)
-        )
-        found = port(inner[0], Norton(source.current, source.admittance + y), s)
-
-        def outwards(signals: Signals) -> Signals:
-            voltage, current = found.outwards(signals)
-            return Signals(voltage, current + y * voltage)
-
-    return found._replace(outwards=outwards)

@@ -54,9 +54,10 @@ class ElementPrior(Module):
         """1/width²."""
         return 1 / self.width**2
 
-    def placed(self, logs: Float[Array, "*start element"]) -> Float[Array, "*start element"]:
+    def placed(self, logs: Float[AnyArray, "*start element"]) -> Float[AnyArray, "*start element"]:
         """Starts with the known elements at their means."""
-        return jnp.where(jnp.isfinite(self.width), self.centre, logs)
+        xp = namespace(logs, self.width)
+        return xp.where(xp.isfinite(self.width), self.centre, logs)
 
     def exact(self, values: Float[Array, " element"]) -> Float[Array, " element"]:
         """Estimates [SI], in which fixed elements are as they were told, to the last digit."""

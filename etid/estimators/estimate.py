@@ -33,8 +33,6 @@ class Estimate(Module):
         strain: Increase of the Σ r² of the calibrations in a joint fit; 0 for other fits.
         hum: Whether the residual shows mains hum; a fit in time does not test for it.
         falls: Whether a resistance that falls with its current explains most of the misfit.
-        late: Whether a resistance that follows its current late explains the residual; only
-            a fit of several amplitudes tests for it.
         doubtful: Whether another gain is likely; `cov` contains its effect.
         support: How well the data support this circuit; None if the estimator does not compute it.
         by_tolerance: What errors of the instrument do to the parameters; None in the same case.
@@ -53,7 +51,6 @@ class Estimate(Module):
     strain: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     hum: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     falls: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
-    late: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     doubtful: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     support: Support | None = None
     by_tolerance: Effects | None = None

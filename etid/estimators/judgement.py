@@ -37,9 +37,6 @@ MISFIT_RRSE = (
 # degrees of freedom are at most the number of parameters of Z_th and the delays. With 12 degrees of
 # freedom the increase exceeds this value once in ten thousand.
 STRAINED = 39.0
-# Largest relative standard error of a current I_0. A linear load has 1/I_0 = 0, whose estimate is
-# nearly normal and must be positive: one linear load of two thousand stays below this limit.
-NO_CURRENT = 1 / 3.3
 BIASED = 16.0  # squared standard errors from an estimate to the minimum of its model
 
 
@@ -161,7 +158,6 @@ def remarks(estimate: Estimate) -> Int[Array, ""]:
     of = (
         (estimate.hum, Remark.mains_hum),
         (estimate.falls, Remark.falls_with_current),
-        (estimate.late, Remark.follows_late),
         (estimate.doubtful, Remark.gain_doubtful),
     )
     return sum((jnp.where(on, int(one), 0) for on, one in of), jnp.zeros((), int))

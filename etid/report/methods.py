@@ -12,8 +12,8 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import etid.identify.amplitudes
 import etid.identify.jointly
+import etid.nonlinear.identify
 import etid.online.state  # these modules describe their methods
 from etid.circuits.display import as_symbol, quantity, several
 from etid.estimators.estimate import MAX_STEPS

@@ -4,22 +4,17 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import SkinCurrent, current_dependent
-from etid.estimators import judgement
-from etid.estimators.amplitudes.fit import fit_amplitudes
-from etid.estimators.amplitudes.terms import Amplitudes, currents, with_filter
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
-from etid.estimators.lanes import Harmonics, stacked
+from etid.estimators.lanes import Harmonics, stacked, taken, unstacked
 from etid.estimators.maximum_likelihood.estimator import description
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import source_of
+from etid.estimators.maximum_likelihood.verdict import judged
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import check_alike, check_distinct, circuit_of, driver_of, fed
 from etid.identify.arguments import recordings as list_of
@@ -27,16 +22,23 @@ from etid.identify.fitting import known_of, remarks_on
 from etid.identify.options import Interval, Options, plan
 from etid.identify.planning import failed_fit
 from etid.identify.skins import successful
-from etid.numpy_tier.tiers import program
-from etid.precision import in_float64
+from etid.nonlinear.amplitudes import Amplitudes, currents
+from etid.nonlinear.fit import fit_amplitudes
+from etid.nonlinear.response import Recorded, with_filter
+from etid.numpy_tier.algebra import one_thread
+from etid.precision import array_function, in_float64
 from etid.recordings.errors import RecordingError
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
+from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
-from etid.results.feed import MEASURED_CURRENT, MeasuredCurrent
+from etid.results.feed import MEASURED_CURRENT
 from etid.results.fit import Fit
-from etid.results.verdicts import RESULTS
+from etid.results.verdicts import RESULTS, verdicts_of
 
+# Largest relative standard error of a current I_0. A linear load has 1/I_0 = 0, whose estimate is
+# nearly normal and must be positive: one linear load of two thousand stays below this limit.
+NO_CURRENT = 1 / 3.3
 METHOD = "amplitudes"
 register_description(
     METHOD,
@@ -50,31 +52,30 @@ register_description(
 )
 
 
-def leaves_much(chi2: Float[Array, ""], rrse: Float[Array, ""]) -> Bool[Array, ""]:
+def leaves_much(chi2: float, rrse: float) -> bool:
     """Whether the residual is too large for the noise, or for any trust."""
     # Single fits have score tests for a small residual with a large χ², such as the rounding of a
     # converter whose step is not known; several amplitudes have none. At an absurdly large gain the
     # noise of V_th would explain any residual: 1, 3 and 5 mA with one seed ended at χ² 0.26 and
     # RRSE 0.78.
-    return (chi2 > 4.0) | (rrse > 0.5)
+    return chi2 > 4.0 or rrse > 0.5
 
 
-@program
-def _fit(
-    lanes: Harmonics,
-    known: GivenDriver,
-    feed: HarmonicDriver | MeasuredCurrent,
-    circuit: AbstractCircuit,
-    prior: ElementPrior | None,
-    bounds: Limits,
-) -> Fit:
-    rate = jnp.asarray(lanes.sample_rate)[0]
-    of = Amplitudes(with_filter(source_of(known)), feed, circuit, lanes.spectrum, rate, prior)
-    estimate = fit_amplitudes(of)
-    fit = judgement.judged(estimate, circuit, feed.result, METHOD, bounds, prior)
-    fit = judgement.unless(fit, leaves_much(estimate.chi2, estimate.rrse), RESULTS.misfit)
-    unsure = fit.stderr.values() > judgement.NO_CURRENT * fit.circuit.values()
-    return judgement.unless(fit, jnp.any(unsure & currents(circuit)), RESULTS.insensitive)
+@one_thread()
+@array_function
+def _fit(of: Amplitudes, driver: RESULTS, bounds: Limits) -> Fit:
+    found, late = fit_amplitudes(of)
+    none = np.zeros(1, bool)
+    fits = judged(found, of.circuit, none, driver, METHOD, of.prior, bounds)
+    (fit,) = unstacked(fits)
+    if late:
+        fit = dataclasses.replace(fit, remarks=fit.remarks | int(Remark.follows_late))
+    if fit.verdict != "successful":
+        return fit
+    unsure = fit.stderr.values() > NO_CURRENT * fit.circuit.values()
+    name = "insensitive" if (unsure & currents(of.circuit)).any() else "successful"
+    name = "misfit" if leaves_much(float(fit.chi2), float(fit.rrse)) else name
+    return dataclasses.replace(fit, result=verdicts_of(np.array(name)))
 
 
 @in_float64
@@ -148,9 +149,14 @@ def identify_amplitudes(
             field="recordings",
             remedy="Add a recording with a fifth of the amplitude, or fix the current I_0",
         )
-    lanes = [Harmonics.of(one) for one in seen]
-    known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
-    fit = jax.device_get(_fit(stacked(lanes), known, feed, load, of_elements, options.bounds))
+    lanes = stacked([Harmonics.of(one) for one in seen])
+    frequency = np.asarray(lanes.frequency)
+    known = known_of(taken(lanes, 0), feed, False, MAXIMUM_LIKELIHOOD)
+    source = with_filter(source_of(jax.tree.map(np.asarray, known)))
+    rate = float(lanes.sample_rate[0])
+    recorded = Recorded(source, feed, load, frequency, rate)
+    of_all = Amplitudes(recorded, lanes.fields, of_elements)
+    fit = _fit(of_all, feed.result, options.bounds)
     remarks = [fit.remarks, *(remarks_on(one, MAXIMUM_LIKELIHOOD) for one in seen)]
     fit = dataclasses.replace(fit, remarks=np.asarray(np.bitwise_or.reduce(remarks)))
     return successful(seen[0].recording, fit) if throw else fit

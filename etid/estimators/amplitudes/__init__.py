@@ -1,1 +1,0 @@
-"""One load, recorded at several amplitudes."""

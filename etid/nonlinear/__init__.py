@@ -1,0 +1,1 @@
+"""One load, recorded at several amplitudes, whose resistance may fall with its current."""
