@@ -18,7 +18,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
-from etid.likelihood.linear import NormalEquations
+from etid.likelihood.linear import DIFFERENCE, NormalEquations, bend
 from etid.nonlinear.response import AbstractResponse, Recorded
 from etid.signals.harmonics import Spectrum, real_parts
 from etid.signals.transfer import power
@@ -129,20 +129,40 @@ class Amplitudes:
         """The terms of all records, whose real and imaginary parts are terms of a fit."""
         return (self.spectra.y - predicted) * self.weight
 
+    def real_terms(self, q: _Row, response: AbstractResponse) -> Float[np.ndarray, "*row term"]:
+        """All terms, of the records and of the priors."""
+        terms = real_parts(self.terms(response.predicted)).reshape(*q.shape[:-1], -1)
+        return np.concatenate([terms, self.priors(q)], -1)
+
     def objective(self, q: _Row) -> Float[np.ndarray, "*row"]:
         """½ Σ r² of all terms."""
-        found = power(self.terms(self.at(q).predicted)).sum((-2, -1))
-        return 0.5 * (found + (self.priors(q) ** 2).sum(-1))
+        return 0.5 * (self.real_terms(q, self.at(q)) ** 2).sum(-1)
 
     def equations(self, q: Float[np.ndarray, "row q"]) -> NormalEquations:
-        """The normal equations at each point."""
+        """The normal equations at each point.
+
+        The effect of an element that the data hardly show is proportional to e^q or e^−q, and has
+        second derivatives of its size. Without them steps would turn back and forth.
+        """
         response, width = self.at(q), self.width
         slopes = self.by_q(response.slopes() * self.weight)
         rows = np.moveaxis(real_parts(slopes), 0, -3).reshape(*q.shape, -1)
-        terms = real_parts(self.terms(response.predicted)).reshape(*q.shape[:-1], -1)
         priors = np.broadcast_to(np.diag(1 / width), (*q.shape, width.size))
-        terms = np.concatenate([terms, self.priors(q)], -1)
-        return NormalEquations.of(terms, np.concatenate([-rows, priors], -1))
+        terms = self.real_terms(q, response)
+        found = NormalEquations.of(terms, np.concatenate([-rows, priors], -1))
+        by_data = np.abs(found.gradient - self.priors(q) / width)
+        more = np.where(np.arange(width.size) < self.elements, by_data, 0.0)
+        return found._replace(matrix=found.matrix + more[..., None] * np.eye(width.size))
+
+    def bend(
+        self,
+        q: Float[np.ndarray, "row q"],
+        at: NormalEquations,
+        move: Float[np.ndarray, "row q"],
+    ) -> Float[np.ndarray, "row q"]:
+        """Jᵀ r″ of a step, as `etid.likelihood.linear.Curved` has it."""
+        ahead = q + DIFFERENCE * move
+        return bend(at, self.real_terms(ahead, self.at(ahead)), move)
 
     def by_q(
         self, by_own: Complex[np.ndarray, "own *row record harmonic"]

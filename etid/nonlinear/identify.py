@@ -69,7 +69,8 @@ def _fit(of: Amplitudes, driver: RESULTS, bounds: Limits) -> Fit:
     fits = judged(found, of.circuit, none, driver, METHOD, of.prior, bounds)
     (fit,) = unstacked(fits)
     if late:
-        fit = dataclasses.replace(fit, remarks=fit.remarks | int(Remark.follows_late))
+        remarks = np.asarray(fit.remarks | int(Remark.follows_late))
+        fit = dataclasses.replace(fit, remarks=remarks)
     if fit.verdict != "successful":
         return fit
     unsure = fit.stderr.values() > NO_CURRENT * fit.circuit.values()
