@@ -16,18 +16,15 @@ from multiprocessing.connection import wait
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Float
 
 from etid.circuits.display import DISPLAY, first_of, heading
-from etid.estimators.unknowns import LoadUnknowns
 from etid.live.output import Output
 from etid.live.stimulator import SENT
 from etid.online.controller import Controller
-from etid.online.pulse_fit import GainModel
 from etid.plotting.layout import Layout, like_fingertip
-from etid.precision import in_float64
+from etid.precision import untraced
 from etid.recordings.errors import in_one_line, install
 from etid.results.verdicts import verdict_names
 
@@ -89,6 +86,7 @@ class LiveView:
                 "the layout of this display"
             )
         self._controller, self._controls, self._names = controller, controls, layout.electrodes
+        self._model = untraced(tracker.model)
         # A pulse is drawn where it exceeds a fifth of its peak, and half as far on both sides.
         high = np.flatnonzero(np.abs(of := bands.waveform()) > 0.2 * np.abs(of).max())
         margin = (high[-1] - high[0]) // 2 + 1
@@ -137,7 +135,6 @@ class LiveView:
         self._words = [NEW] * number
         self._above = np.zeros(number, bool)  # the charge cap, since the last snapshot
         self._alarms: deque[str] = deque(maxlen=ALARMS)
-        self._compile()
 
     @property
     def stopped(self) -> bool:
@@ -224,12 +221,6 @@ class LiveView:
         said = zero if error is None else in_one_line(error)
         self.close(f"{how} {after}{': ' * bool(said)}{said.removesuffix('.')}.", bad=bad)
 
-    def _compile(self) -> None:
-        """Compile what `show` uses, before a pulse waits."""
-        state = self._controller.tracker.start()
-        self._gain(np.asarray(state.electrodes.own)[0])
-        self._controller.tracker.bad_electrodes(state)
-
     def _seen(self, tick: "Tick") -> list[str]:
         """The state of each electrode in words."""
         tracker, state = self._controller.tracker, tick.state
@@ -280,16 +271,7 @@ class LiveView:
         if not np.asarray(before.pulses)[at]:
             return np.full(self._snapshot["predicted"].shape[-1], np.nan)
         bands = self._controller.tracker.model.bands
-        gain = self._gain(np.asarray(before.own)[at])
+        gain = self._model.undelayed(np.asarray(before.own)[at, :-1])
         pulse = bands.waveform(gain, float(np.asarray(state.own)[at, -1]))
         pulse = np.asarray(state.amplitude)[at] * pulse
         return pulse[self._part] + tick.window[at].mean()
-
-    @in_float64
-    def _gain(self, own: Float[np.ndarray, " own"]) -> Complex[np.ndarray, " band"]:
-        return np.asarray(_undelayed(self._controller.tracker.model, own))
-
-
-@jax.jit
-def _undelayed(model: GainModel, own: Float[Array, " own"]) -> Complex[Array, " band"]:
-    return model.undelayed(LoadUnknowns.of(own).log_elements)

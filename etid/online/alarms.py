@@ -70,6 +70,8 @@ from jaxtyping import Array, Bool, Float, Int
 from etid.circuits.directions import DIRECTIONS
 from etid.likelihood.scores import NOTHING, Scores
 from etid.online.pulse_fit import Expected, Pulse
+from etid.precision import namespace
+from etid.signals.transfer import AnyArray
 from etid.solvers.matrices import inverse_of_few
 
 MOVED, SPREAD = DIRECTIONS["gain"].moves, DIRECTIONS["spread"].least
@@ -222,16 +224,16 @@ class PulseScores(NamedTuple):
 
 
 def estimate(
-    sums: Float[Array, "*change 3"],
-) -> tuple[Float[Array, "*change"], Float[Array, "*change"]]:
+    sums: Float[AnyArray, "*change 3"],
+) -> tuple[Float[AnyArray, "*change"], Float[AnyArray, "*change"]]:
     """Estimate of a change from its sums s, I and c, and its standard error; 0 if I is 0."""
-    score, information, common = jnp.moveaxis(sums, -1, 0)
-    known = jnp.where(information > 0, information, jnp.inf)
-    return score / known, jnp.sqrt(information + common**2) / known
+    xp, (score, information, common) = namespace(sums), (sums[..., part] for part in range(3))
+    known = xp.where(information > 0, information, xp.inf)
+    return score / known, xp.sqrt(information + common**2) / known
 
 
-def score_of(sums: Float[Array, " 3"], slope: Float[Array, " element"]) -> Scores:
+def score_of(sums: Float[AnyArray, "*row 3"], slope: Float[AnyArray, "*row element"]) -> Scores:
     """The score of a change from its sums s, I and c, and the slopes of the elements."""
-    size, stderr = estimate(sums)
-    moved, z = jnp.abs(size) * jnp.max(jnp.abs(slope)), size / stderr
+    xp, (size, stderr) = namespace(sums), estimate(sums)
+    moved, z = xp.abs(size) * xp.abs(slope).max(-1), size / stderr
     return Scores(z, size, moved, stderr, slope, slope, z**2)

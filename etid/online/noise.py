@@ -29,7 +29,8 @@ are multiplied by a root of C⁻¹.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from etid.precision import Module
+from etid.precision import Module, namespace
+from etid.signals.transfer import AnyArray
 
 MEMORY = 256  # pulses from which the noise is known
 SOON = 32.0  # pulses from which hum on a harmonic is known
@@ -123,25 +124,30 @@ class Noise(Module):
         )
 
 
-def directions(patterns: Float[Array, "pattern part"]) -> Float[Array, "pattern part"]:
+def directions(
+    patterns: Float[AnyArray, "*row pattern part"],
+) -> Float[AnyArray, "*row pattern part"]:
     """Vectors q of which `cleared` makes a root of C⁻¹ = (1 + Σ p pᵀ)⁻¹.
 
     Args:
         patterns: Sines and cosines p, in standard deviations of the other noise.
     """
-    found: list[Float[Array, " part"]] = []
-    for p in patterns:
+    xp, found = namespace(patterns), list[AnyArray]()
+    for number in range(patterns.shape[-2]):
+        p = patterns[..., number, :]
         for q in found:
-            p = p - q * jnp.dot(q, p)
-        root = jnp.sqrt(1 + jnp.dot(p, p))
-        found.append(p / jnp.sqrt(root * (root + 1)))  # (1 + p pᵀ)^(-½) = 1 − q qᵀ
-    return jnp.stack(found) if found else jnp.zeros_like(patterns)
+            p = p - q * (q * p).sum(-1, keepdims=True)
+        root = xp.sqrt(1 + (p * p).sum(-1, keepdims=True))
+        found.append(p / xp.sqrt(root * (root + 1)))  # (1 + p pᵀ)^(-½) = 1 − q qᵀ
+    return xp.stack(found, -2) if found else xp.zeros_like(patterns)
 
 
 def cleared(
-    values: Float[Array, "*value part"], lines: Float[Array, "pattern part"]
-) -> Float[Array, "*value part"]:
+    values: Float[AnyArray, "*row value part"],
+    lines: Float[AnyArray, "*row pattern part"],
+) -> Float[AnyArray, "*row value part"]:
     """`values` times a root of C⁻¹."""
-    for q in lines:
-        values = values - jnp.tensordot(values @ q, q, 0)
+    for number in range(lines.shape[-2]):
+        q = lines[..., number, :]
+        values = values - (values @ q[..., None]) * q[..., None, :]
     return values

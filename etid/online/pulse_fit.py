@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.circuits.circuit import AbstractCircuit, with_slopes
+from etid.circuits.circuit import AbstractCircuit, impedance_at, with_slopes
 from etid.circuits.directions import At, spread
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import source_of
@@ -24,9 +24,17 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.online.gain_bands import Bands
 from etid.online.noise import cleared
-from etid.precision import Module
+from etid.precision import Module, namespace
 from etid.signals.harmonics import real_parts
-from etid.signals.transfer import as_complex, combined, frequency_variable, power, reciprocal
+from etid.signals.transfer import (
+    AnyArray,
+    as_complex,
+    combined,
+    frequency_variable,
+    from_parts,
+    power,
+    reciprocal,
+)
 from etid.solvers.matrices import inverse_of_few, root
 
 STEP = 0.1  # [samples] spacing of the grid of delays
@@ -35,9 +43,10 @@ SEARCH = 40  # largest number of steps of a search
 SETTLED = 1.0  # distance to the minimum before the last step [standard errors of one pulse]
 
 
-def _unit(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
+def _unit(angle: Float[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
     """e^(j angle)."""
-    return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+    xp = namespace(angle)
+    return from_parts(xp.cos(angle), xp.sin(angle))
 
 
 class Expected(NamedTuple):
@@ -51,14 +60,14 @@ class Expected(NamedTuple):
         aliased: Aliases, for a delay of 0.
     """
 
-    gain: Complex[Array, "*lane band"]
-    slope: Complex[Array, "*lane element band"]
-    spread: Complex[Array, "*lane band"]
-    aliased: Complex[Array, "*lane band"]
+    gain: Complex[AnyArray, "*lane band"]
+    slope: Complex[AnyArray, "*lane element band"]
+    spread: Complex[AnyArray, "*lane band"]
+    aliased: Complex[AnyArray, "*lane band"]
 
 
 class GainModel(Module):
-    """Model of the gain of a pulse.
+    """Model of the gain of a pulse, or of pulses along leading axes.
 
     Attributes:
         circuit: Structure of the load.
@@ -76,13 +85,13 @@ class GainModel(Module):
 
     circuit: AbstractCircuit
     bands: Bands
-    source: Complex[Array, " band"]
-    source_alias: Complex[Array, " band"]
-    turn: Float[Array, " band"]
-    turns: Complex[Array, "delay band"]
-    noise_freedom: Float[Array, ""]
-    source_error: Complex[Array, "z band"]
-    faults: Float[Array, "z 3"] | None = None
+    source: Complex[AnyArray, " band"]
+    source_alias: Complex[AnyArray, " band"]
+    turn: Float[AnyArray, " band"]
+    turns: Complex[AnyArray, "delay band"]
+    noise_freedom: Float[AnyArray, ""]
+    source_error: Complex[AnyArray, "z band"]
+    faults: Float[AnyArray, "z 3"] | None = None
 
     @classmethod
     def of(
@@ -116,31 +125,38 @@ class GainModel(Module):
         by_fault = real_parts(self._by_fault(gain))
         return found + real_parts(weights) @ by_fault.T @ self.faults.T
 
-    def by_error(self, gain: Complex[Array, " band"]) -> Complex[Array, "z band"]:
+    def by_error(self, gain: Complex[AnyArray, "*row band"]) -> Complex[AnyArray, "*row z band"]:
         """Changes of a gain by each independent error of calibrations and instrument."""
         # ∂G/∂ log Z_th = −G (1 − G)
-        found = (gain * (gain - 1))[None, :] * self.source_error
+        found = (gain * (gain - 1))[..., None, :] * self.source_error
         if self.faults is None:
             return found
-        return found + combined(self.faults, self._by_fault(gain))
+        by_fault = self._by_fault(gain)
+        return found + from_parts(self.faults @ by_fault.real, self.faults @ by_fault.imag)
 
-    def _by_fault(self, gain: Complex[Array, " band"]) -> Complex[Array, "3 band"]:
+    def _by_fault(self, gain: Complex[AnyArray, "*row band"]) -> Complex[AnyArray, "*row 3 band"]:
         # ∂G/∂C = −s Z_L² ∂G/∂Z_L
         by_capacitance = -frequency_variable(self.bands.frequency) * self.source * gain**2
-        return jnp.stack([gain, jnp.ones_like(gain), by_capacitance])
+        xp = namespace(gain)
+        return xp.stack([gain, xp.ones_like(gain), by_capacitance], -2)
 
-    def expected(self, logs: Float[Array, " element"]) -> "Expected":
+    def expected(self, logs: Float[AnyArray, "*row element"]) -> "Expected":
         """The gain of a load, and its derivatives."""
-        z, by_element = with_slopes(self.circuit, logs, self.bands.frequency)
+        frequency = self.bands.frequency
+        z, by_element = with_slopes(self.circuit, logs, frequency)
         admittance = reciprocal(z + self.source)
         by_z = self.source * admittance * admittance
-        circuit = self.circuit.with_log_values(logs)
-        alike = At(
-            self.bands.frequency, z, impedance=circuit.response, exponents=bool(circuit.exponents())
-        )
-        above = circuit.response(self.bands.sample_rate - self.bands.frequency)
-        aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
-        return Expected(z * admittance, by_element * by_z[None, :], spread(alike) * by_z, aliased)
+
+        def impedance(frequency: Float[AnyArray, " band"]) -> Complex[AnyArray, "*row band"]:
+            return impedance_at(self.circuit, logs, frequency)
+
+        exponents = bool(self.circuit.exponents())
+        alike = At(frequency, z, impedance=impedance, exponents=exponents)
+        above = impedance(self.bands.sample_rate - frequency)
+        other = above * reciprocal(above + self.source_alias)
+        aliased = namespace(other).conj(other) * self.bands.alias
+        slope = by_element * by_z[..., None, :]
+        return Expected(z * admittance, slope, spread(alike) * by_z, aliased)
 
     def departure(self, at: "Expected", delay: Float[Array, ""]) -> Complex[Array, " band"]:
         """Ĝ − G e^(−jωτ): aliases, and the effect of the curvature of G over a band."""
@@ -148,21 +164,22 @@ class GainModel(Module):
         departure = departure + self.bands.departure(at.gain, delay)
         return departure * jnp.conj(self.turned(delay))
 
-    def turned(self, delay: Float[Array, ""]) -> Complex[Array, " band"]:
+    def turned(self, delay: Float[AnyArray, "*row"]) -> Complex[AnyArray, "*row band"]:
         """e^(jωτ) from a table and a Taylor series: a sine costs as much as the rest of the fit."""
-        near = jnp.clip(jnp.round((delay - DELAYS[0]) / STEP), 0, DELAYS.size - 1).astype(int)
-        angle = (delay - jnp.asarray(DELAYS)[near]) * self.turn
+        xp = namespace(delay)
+        near = xp.clip(xp.round((delay - DELAYS[0]) / STEP), 0, DELAYS.size - 1).astype(int)
+        angle = (delay - xp.asarray(DELAYS)[near])[..., None] * self.turn
         square = angle * angle
         cosine = 1 - square / 2 * (1 - square / 12 * (1 - square / 30))
         sine = angle * (1 - square / 6 * (1 - square / 20 * (1 - square / 42)))
-        return self.turns[near] * jax.lax.complex(cosine, sine)
+        return self.turns[near] * from_parts(cosine, sine)
 
     def patterns(
         self,
-        delay: Float[Array, ""],
-        weight: Float[Array, " band"],
-        line: Float[Array, " line"],
-    ) -> Float[Array, "pattern part"]:
+        delay: Float[AnyArray, "*row"],
+        weight: Float[AnyArray, "*row band"],
+        line: Float[AnyArray, "*row line"],
+    ) -> Float[AnyArray, "*row pattern part"]:
         """Lines of the mains in the residual of a delayed pulse [standard deviations].
 
         Args:
@@ -170,12 +187,14 @@ class GainModel(Module):
             weight: Weight of |Ĝ − G|² in each band.
             line: Deviation of each line, for a pulse of the amplitude of the unloaded record [V].
         """
-        turned = self.turned(delay) * as_complex(jnp.sqrt(weight))
-        return real_parts(self.bands.lines * turned[None, :]) * jnp.repeat(line, 2)[:, None]
+        xp = namespace(weight, line)
+        scale = self.turned(delay) * as_complex(xp.sqrt(weight))
+        deviation = xp.repeat(line, 2, axis=-1)[..., None]
+        return real_parts(self.bands.lines * scale[..., None, :]) * deviation
 
-    def undelayed(self, logs: Float[Array, " element"]) -> Complex[Array, " band"]:
+    def undelayed(self, logs: Float[AnyArray, "*row element"]) -> Complex[AnyArray, "*row band"]:
         """The gain without a delay."""
-        z = self.circuit.with_log_values(logs).response(self.bands.frequency)
+        z = impedance_at(self.circuit, logs, self.bands.frequency)
         return z * reciprocal(z + self.source)
 
 
@@ -313,7 +332,7 @@ def searched(
 
 
 class Pulse(Module):
-    """The objective for one electrode at one pulse.
+    """The objective for one electrode at one pulse, or for several along leading axes.
 
     Attributes:
         model: Model of the gain.
@@ -325,16 +344,18 @@ class Pulse(Module):
     """
 
     model: GainModel
-    gain: Complex[Array, " band"]
-    weight: Float[Array, " band"]
-    centre: Float[Array, " element"]
-    information: Float[Array, "element element"]
-    lines: Float[Array, "pattern part"]
+    gain: Complex[AnyArray, "*row band"]
+    weight: Float[AnyArray, "*row band"]
+    centre: Float[AnyArray, "*row element"]
+    information: Float[AnyArray, "*row element element"]
+    lines: Float[AnyArray, "*row pattern part"]
 
-    def whitened(self, gains: Complex[Array, "*value band"]) -> Float[Array, "*value part"]:
+    def whitened(
+        self, gains: Complex[AnyArray, "*row value band"]
+    ) -> Float[AnyArray, "*row value part"]:
         """Gains in standard deviations of the noise."""
-        root = jnp.broadcast_to(as_complex(jnp.sqrt(self.weight)), gains.shape)
-        return cleared(real_parts(gains * root), self.lines)
+        root = as_complex(namespace(self.weight).sqrt(self.weight))
+        return cleared(real_parts(gains * root[..., None, :]), self.lines)
 
     def errors_along(
         self, gain: Complex[Array, " band"], directions: Float[Array, "value part"]
@@ -344,26 +365,25 @@ class Pulse(Module):
         weights = jax.lax.complex(*parts) * as_complex(jnp.sqrt(self.weight))[None, :]
         return self.model.errors_along(gain, weights)
 
-    def by_x(self, gain: Complex[Array, " band"]) -> Float[Array, " part"]:
+    def by_x(self, gain: Complex[AnyArray, "*row band"]) -> Float[AnyArray, "*row part"]:
         """Variance of the residual by the noise of the unloaded record."""
-        of = self.model.bands
-        each = self.weight / jnp.where(of.weight > 0, of.weight, 1.0)
-        return jnp.tile(power(gain) * of.variance_x * each, 2)
+        xp, of = namespace(gain), self.model.bands
+        each = power(gain) * of.variance_x * self.weight / xp.where(of.weight > 0, of.weight, 1.0)
+        return xp.concatenate([each, each], -1)
 
-    def jacobian(self, expected: Expected) -> Float[Array, "own part"]:
+    def jacobian(self, expected: Expected) -> Float[AnyArray, "*row own part"]:
         """Derivatives of the residual with respect to the elements and the delay."""
-        turn = self.model.turn
+        xp, turn = namespace(expected.gain), self.model.turn
         # The derivative with respect to the delay is jω Ĝ e^(jωτ). Here the model replaces Ĝ:
         # otherwise the noise of Ĝ would count as information.
-        by_delay = expected.gain * jax.lax.complex(jnp.zeros_like(turn), turn)
-        rows = jnp.concatenate([-expected.slope, by_delay[None, :]])
-        return self.whitened(rows)
+        by_delay = expected.gain * from_parts(xp.zeros_like(turn), turn)
+        return self.whitened(xp.concatenate([-expected.slope, by_delay[..., None, :]], -2))
 
     def residual(
         self, expected: Complex[Array, " band"], delay: Float[Array, ""]
     ) -> Float[Array, " part"]:
         """Measured minus expected gain [standard deviations], for a delay [samples]."""
-        return self.whitened(self.gain * self.model.turned(delay) - expected)
+        return self.whitened((self.gain * self.model.turned(delay) - expected)[None])[0]
 
     def prior(self, own: LoadUnknowns) -> tuple[Float[Array, " own"], Float[Array, ""]]:
         """Squared distance from what is known before the pulse: half its gradient, and itself."""

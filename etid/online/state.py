@@ -4,26 +4,24 @@ import dataclasses
 import math
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.display import rounded, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import Description
-from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
+from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE
 from etid.estimators.registry import register_description
-from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.linear import diagonal, inverse
 from etid.likelihood.scores import doubt
 from etid.online.alarms import MOVED, SEEN_IN_PULSES, SPREAD, score_of
 from etid.online.noise import Noise, directions
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
 from etid.online.repeats import Windows
-from etid.precision import Module
+from etid.precision import Module, array_function
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
-from etid.results.verdicts import RESULTS, counted, first_verdict, verdict_names
-from etid.solvers.matrices import inverse
+from etid.results.verdicts import RESULTS, counted, verdict_names, verdicts_of
 
 METHOD = "online"
 OPEN = 0.99  # effective gain above which an electrode touches nothing
@@ -165,50 +163,54 @@ class TrackerState(Overviewed, Module):
         )
 
 
-def fit_of(
+@array_function
+def fits_of(
     model: GainModel,
     driver_result: RESULTS,
-    driver_changed: Bool[Array, ""],
+    driver_changed: bool,
     state: ElectrodeState,
     noise: Noise,
 ) -> Fit:
-    """The fit of one electrode."""
-    bands = model.bands
-    logs = LoadUnknowns.of(state.own).log_elements
-    elements = logs.size
+    """The fits of all electrodes, in NumPy."""
+    bands, logs = model.bands, state.own[:, :-1]
+    lanes, elements = logs.shape
     expected = model.expected(logs)
-    nothing = jnp.zeros((elements, elements))
-    weight = bands.weight / state.variance / noise.bands
-    lines = directions(model.patterns(jnp.zeros(()), weight, noise.line))
-    pulse = Pulse(model, jnp.zeros_like(expected.gain), weight, logs, nothing, lines)
+    nothing = np.zeros((lanes, elements, elements))
+    weight = bands.weight / state.variance[:, None] / noise.bands
+    lines = directions(model.patterns(np.zeros(lanes), weight, noise.line))
+    pulse = Pulse(model, np.zeros_like(expected.gain), weight, logs, nothing, lines)
     jacobian = pulse.jacobian(expected)
-    by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
-    of_source = by_term @ pulse.whitened(model.by_error(expected.gain)).T
+    by_term = inverse(jacobian @ jacobian.swapaxes(-1, -2))[:, :elements] @ jacobian
+    of_source = by_term @ pulse.whitened(model.by_error(expected.gain)).swapaxes(-1, -2)
     # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
-    of_x = pulse.by_x(expected.gain)
-    slope = -by_term @ pulse.whitened(expected.gain)
-    likely, of_doubt = doubt(score_of(state.scores[0], slope), jnp.zeros((), bool))
-    shared = of_source @ of_source.T + (by_term * of_x[None, :]) @ by_term.T + of_doubt
+    of_x = by_term * np.sqrt(pulse.by_x(expected.gain))[:, None]
+    by_gain = pulse.whitened(expected.gain[:, None])
+    slope = -(by_term @ by_gain.swapaxes(-1, -2))[..., 0]
+    likely, of_doubt = doubt(score_of(state.scores[:, 0], slope), np.zeros(lanes, bool))
+    shared = sum((of @ of.swapaxes(-1, -2) for of in (of_source, of_x)), of_doubt)
     cov = inverse(state.information) + shared
-    relative = jnp.sqrt(jnp.diagonal(cov))
-    fitted = model.circuit.with_log_values(logs)
-    scale = jnp.outer(fitted.values(), fitted.values())
-    known_at_all = state.pulses > 0
+    values, known = np.exp(logs), (state.pulses > 0)[:, None, None]
+    scale = np.where(known, values[:, :, None] * values[:, None, :], np.nan)
+    later = np.select(
+        [
+            ~(diagonal(cov) < 1).all(-1),
+            np.full(lanes, verdict_names(driver_result) != "successful"),
+            np.full(lanes, driver_changed),
+        ],
+        ["insensitive", "driver_failed", "inconsistent"],
+        "successful",
+    )
+    names = verdict_names(state.result)
     return Fit(
-        circuit=fitted,
-        cov=jnp.where(known_at_all, cov * scale, jnp.nan),
-        shared_cov=jnp.where(known_at_all, shared * scale, jnp.nan),
+        circuit=model.circuit.of_fit(values.T),
+        cov=cov * scale,
+        shared_cov=shared * scale,
         rrse=state.rrse,
         chi2=state.chi2,
-        result=first_verdict(
-            (state.result != SUCCESSFUL, state.result),
-            (~jnp.all(relative < 1), RESULTS.insensitive),
-            (driver_result != SUCCESSFUL, RESULTS.driver_failed),
-            (driver_changed, RESULTS.inconsistent),
-        ),
+        result=verdicts_of(np.where(names == "successful", later, names)),
         steps=state.pulses,
         method=METHOD,
-        remarks=jnp.where(likely, int(Remark.gain_doubtful), 0),
+        remarks=np.where(likely, int(Remark.gain_doubtful), 0),
     )
 
 

@@ -40,15 +40,14 @@ of one or two per cent in C_p.
 """
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Float
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, impedance_at
 from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
@@ -56,7 +55,6 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import circuit_of, number_of, require
 from etid.identify.fitting import known_at
 from etid.identify.planning import explained
-from etid.numpy_tier.tiers import program
 from etid.online.alarms import limit
 from etid.online.clock import Clock
 from etid.online.gain_bands import unloaded_bands
@@ -70,15 +68,15 @@ from etid.online.state import (
     TrackerState,
     bad_electrodes,
     changes,
-    fit_of,
+    fits_of,
 )
 from etid.online.tick import updated
-from etid.precision import Kept, in_float64
+from etid.precision import Kept, in_float64, untraced
 from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver, HarmonicDriver
-from etid.results.fit import Fit, IdentificationError
+from etid.results.fit import IdentificationError
 from etid.results.fits import Fits
 from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
@@ -302,10 +300,8 @@ class Tracker(Overviewed, Kept):
     @in_float64
     def clock(self) -> Clock:
         """A clock for the pulses of one stream."""
-        model = self.model
-        logs = jax.device_put(model.circuit.log_values())
-        gain = np.asarray(_undelayed(model, logs))
-        return Clock(self.period, model.bands.waveform(gain))
+        model = untraced(self.model)
+        return Clock(self.period, model.bands.waveform(model.undelayed(model.circuit.log_values())))
 
     @in_float64
     def update(
@@ -383,10 +379,9 @@ class Tracker(Overviewed, Kept):
             RecordingError: `state` is no state of a tracker.
         """
         self.check(state)
-        found = _judged(
-            self.model, self.driver_result, state.electrodes, state.driver_changed, state.noise
-        )
-        fit = jax.tree.map(np.asarray, found)
+        model, electrodes, noise = untraced((self.model, state.electrodes, state.noise))
+        changed = bool(state.driver_changed)
+        fit = fits_of(model, self.driver_result, changed, electrodes, noise)
         electrodes = [
             {"path": f"electrode/{number}", "electrode": str(number)}
             for number in range(self.electrodes)
@@ -417,7 +412,9 @@ class Tracker(Overviewed, Kept):
         Args:
             state: State of the tracker.
         """
-        return bad_electrodes(state, np.abs(np.asarray(_lowest(self.model, state.electrodes.own))))
+        logs, model = np.asarray(state.electrodes.own)[:, :-1], self.model
+        lowest = impedance_at(model.circuit, logs, np.asarray(model.bands.frequency)[:1])
+        return bad_electrodes(state, np.abs(lowest[:, 0]))
 
 
 def for_each(name: str, given: Any, electrodes: int) -> Float[np.ndarray, " lane"]:
@@ -435,27 +432,3 @@ def for_each(name: str, given: Any, electrodes: int) -> Float[np.ndarray, " lane
     if not (np.isfinite(found) & (found >= 0)).all():
         raise ValueError(f"{name} is {found}; it must be finite and not negative")
     return np.full(electrodes, found)
-
-
-@program
-def _judged(
-    model: GainModel,
-    driver_result: RESULTS,
-    electrodes: ElectrodeState,
-    driver_changed: Bool[Array, ""],
-    noise: Noise,
-) -> Fit:
-    fit = partial(fit_of, model, driver_result, driver_changed)
-    return jax.vmap(fit)(electrodes, noise)
-
-
-@jax.jit
-def _undelayed(model: GainModel, logs: Float[Array, " element"]) -> Complex[Array, " band"]:
-    return model.undelayed(logs)
-
-
-@jax.jit  # as `etid.online.tick.updated`
-def _lowest(model: GainModel, own: Float[Array, "lane own"]) -> Complex[Array, " lane"]:
-    """Impedance of each load at the lowest frequency [Ω]."""
-    lowest = model.bands.frequency[:1]
-    return jax.vmap(lambda one: model.circuit.with_log_values(one[:-1]).response(lowest)[0])(own)
