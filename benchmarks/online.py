@@ -118,7 +118,7 @@ def seconds_of_filterpy(
     Its filters start near the logarithms that the tracker has found; a `RivalError` if there is no
     filterpy.
     """
-    seen = [tracker.projection.seen(v_out, tracker.adc_range) for v_out in pulses]
+    seen = [tracker.projection.band_sums(v_out, tracker.adc_range) for v_out in pulses]
     variance, begins = np.stack([of.variance for of in seen]), np.arange(len(pulses)) % 3
     found = exchange(
         "filterpy",

@@ -17,7 +17,7 @@ from etid.online import state as states
 from etid.online.alarms import MOVED, SEEN_IN_PULSES, SPREAD, PulseScores
 from etid.online.gain_bands import Bands
 from etid.online.noise import Noise
-from etid.online.projection import Seen
+from etid.online.projection import BandSums
 from etid.online.pulse_fit import Expected, GainModel
 from etid.online.repeats import Windows
 from etid.online.state import DRIFT, JUMP, NONE, REPEATED, ElectrodeState, TrackerState
@@ -538,7 +538,7 @@ def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch
     object.__setattr__(bands, "weight", jnp.asarray(weight))
     zero = np.zeros(len(rows))
     sums = np.stack([*np.zeros((6, len(rows))), mean, zero, zero], axis=1)
-    seen = Seen(sums, variance, clipped, (verdict == "repeated") | (verdict == "flat"))
+    seen = BandSums(sums, variance, clipped, (verdict == "repeated") | (verdict == "flat"))
     state = state_of(amplitude=before, offset=offset).electrodes
     noise = Noise.of(jnp.ones(3), 0, 1.0, len(rows))
     found = tick.measured_pulse(bands, seen, jnp.asarray(amplitude), state, noise)

@@ -120,7 +120,7 @@ def test_gain_and_noise_are_those_of_a_straight_line_in_each_band(exact):
     number = np.arange(SIZE // 2 + 1)
     gain = 0.5 - 1e-4 * number + 1e-4j * number
     v_out = np.fft.irfft(np.fft.rfft(window()) * gain, SIZE)[None, :].repeat(100, axis=0)
-    seen = projection.seen(v_out, UNLIMITED)
+    seen = projection.band_sums(v_out, UNLIMITED)
     assert seen.variance == pytest.approx(projection.floor)
     assert not seen.clipped.any()
     found, weight = measured(of, seen, white(of, 100), np.zeros(100), np.zeros(100))
@@ -130,7 +130,7 @@ def test_gain_and_noise_are_those_of_a_straight_line_in_each_band(exact):
     np.testing.assert_allclose(found[0], expected, atol=1e-4)
     np.testing.assert_allclose(weight[0], of.weight / projection.floor, rtol=1e-6)
 
-    noisy = projection.seen(v_out + noise * rng.standard_normal(v_out.shape), UNLIMITED)
+    noisy = projection.band_sums(v_out + noise * rng.standard_normal(v_out.shape), UNLIMITED)
     freedom = sum(count for _, count in projection.runs) * (projection.within.shape[1] - 1)
     uncertain = 5 * np.sqrt(2 / freedom / 100)
     assert np.mean(noisy.variance) == pytest.approx(SIZE * noise**2, rel=uncertain)
@@ -148,7 +148,7 @@ def test_what_a_window_lacks_of_the_tail_is_added_to_the_gain(exact):
     tail = 3.0 * np.exp(-DECAY * (SIZE + np.arange(SIZE)))
     offset = np.array([0.3, 0.0, -0.2])
     v_out = 0.5 * (window() - lacking[:, None] * tail) + offset[:, None]
-    seen = projection.seen(v_out, UNLIMITED)
+    seen = projection.band_sums(v_out, UNLIMITED)
     found, weight = measured(of, seen, white(of, 3), lacking, offset)
     before, _ = measured(of, seen, white(of, 3), np.zeros(3), offset)
     error = abs(np.asarray(found) - 0.5).max(1)
@@ -185,12 +185,12 @@ def test_the_tail_of_a_load_has_its_own_rate_as_far_as_noise_lets_it_be_seen(exa
     span = DECAY * (SIZE - last - middle)
     # Noise by which the logarithm of the rate is as uncertain as loads make it.
     equal = (0.2 * span) ** 2 * SIZE * last / (early[0] ** -2 + late[0] ** -2)
-    seen = projection.seen(v_out, UNLIMITED)
+    seen = projection.band_sums(v_out, UNLIMITED)
     for found, mean in zip(seen.means(), (v_out.mean(1), early, late), strict=True):
         np.testing.assert_allclose(found, mean, rtol=1e-6)
     variance = np.array([0.0, equal, 1e9 * equal, 0.0])
-    sums = np.column_stack([seen.sums[:, :-2], early, late])
-    seen = seen._replace(sums=sums, variance=variance)
+    sums = np.column_stack([seen.values[:, :-2], early, late])
+    seen = seen._replace(values=sums, variance=variance)
     found = np.asarray(lacking_tail(of, seen, lacking, np.zeros(4)))
     left = late / (1 - 0.5 * np.exp(-1.0))
     shape, by_rate = np.asarray(of.tail)

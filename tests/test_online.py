@@ -348,7 +348,7 @@ def test_weights_are_those_of_the_noise_in_the_bands():
     """And slopes that are alike in neighbouring bands have the stated information."""
     tracker = tracker_of(TEN)
     noise = NOISE * np.random.default_rng(9).standard_normal((4000, 3333))
-    seen = tracker.projection.seen(noise, np.array([-np.inf, np.inf]))
+    seen = tracker.projection.band_sums(noise, np.array([-np.inf, np.inf]))
     bands = tracker.model.bands
     gain = np.stack([np.real(seen.gain()), np.imag(seen.gain())])
     weight = np.asarray(bands.weight) / (bands.samples * NOISE**2)

@@ -93,7 +93,7 @@ def test_noise_of_the_unloaded_record_is_known_by_frequency():
     tracker = Tracker.of(driver, record, electrodes=TEN)
     bands = tracker.model.bands
     _, response = scipy.signal.sosfreqz(sos, np.asarray(bands.frequency), fs=RATE)
-    level = np.mean(tracker.projection.seen(noise[1:, :3333], tracker.adc_range).variance)
+    level = np.mean(tracker.projection.band_sums(noise[1:, :3333], tracker.adc_range).variance)
     expected = 3333 * (10 * NOISE) ** 2 * np.abs(response) ** 2 / level
     assert expected.max() > 2 * expected.min()
     # Means of seven bands, each of 22 squares: a standard error of 8 %, and the level's 5. At the

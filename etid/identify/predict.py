@@ -137,7 +137,7 @@ def fitted_voltage(
     free = simulate(alone, np.zeros((forced.size, 0)), np.eye(states))[0]
     known, late = [*free, xp.ones_like(forced)], None  # a measured current has no calibration
     if isinstance(feed.source, SourceImpedance):
-        late = hold(_late(feed.source, load, loop, float(feed.r_known)), sample_rate)
+        late = hold(_delayed_calibration(feed.source, load, loop, float(feed.r_known)), sample_rate)
     degrees, powers = np.arange(1.0, inputs.shape[1]), np.arange(1.0, delayed.shape[1])
     rates = np.pad(inputs[:, 1:] * degrees, ((0, 0), (0, 1)))  # per sample
 
@@ -180,7 +180,9 @@ def _least_squares(
     return inverse, q, rest - basis @ q
 
 
-def _late(source: SourceImpedance, load: StateSpace, loop: StateSpace, r_load: float) -> StateSpace:
+def _delayed_calibration(
+    source: SourceImpedance, load: StateSpace, loop: StateSpace, r_load: float
+) -> StateSpace:
     """From the rate of V_th to V_out by a late calibration; the delays of V_out belong to it too.
 
     The voltage R_L I − V_out at the excess impedance acts as one more V_th.

@@ -13,7 +13,7 @@ from etid.results.instrument import Effects
 from etid.signals.transfer import power
 
 # Reductions of ½ Σ r² that are enough: first as a part of it; then that of 0.01 standard errors.
-ROUGHLY, WELL = 1e-3, 5e-5
+COARSE, FINE = 1e-3, 5e-5
 DAMPING, STEPS = 1e-2, 500
 
 
@@ -30,13 +30,13 @@ def fit_amplitudes(of: Amplitudes) -> tuple[Estimate, bool]:
     q = every[[np.where(np.isfinite(found), found, np.inf).argmin()]]
     # First with Z_th fixed: from a distant start, a joint fit would distort Z_th.
     own = np.arange(q.size) < of.elements + of.count
-    roughly = LevenbergMarquardt(DAMPING, STEPS, relative=ROUGHLY, free=own)
+    coarse = LevenbergMarquardt(DAMPING, STEPS, relative=COARSE, free=own)
     for _ in range(2):
-        q = roughly(of, q, of.equations(q), 0.0).q
+        q = coarse(of, q, of.equations(q), 0.0).q
         of = of.weighted(of.own(q[0]))
     # For a load that is nearly linear, the valley is curved along R_s and I_0.
-    well = LevenbergMarquardt(DAMPING, STEPS, curved=True)
-    state = well(of, q, of.equations(q), WELL)
+    fine = LevenbergMarquardt(DAMPING, STEPS, curved=True)
+    state = fine(of, q, of.equations(q), FINE)
     return _estimate(of, state)
 
 

@@ -53,7 +53,7 @@ class Step(NamedTuple):
     slopes: Complex[np.ndarray, "own record harmonic"]
 
 
-class _Around(NamedTuple):
+class _Linearised(NamedTuple):
     """The terms around some X; all vectors are scaled by the weights.
 
     Attributes:
@@ -90,14 +90,14 @@ def last_step(of: Amplitudes, q: Float[np.ndarray, " q"]) -> Step:
     """The step from the minimum `q` of the terms to the efficient estimate."""
     own, spectra, weight = of.own(q), of.spectra, of.weight
 
-    def around(x: _Numbers, variance_x: Float[np.ndarray, "record harmonic"]) -> _Around:
-        return _Around(of.recorded.at(own, x), weight, variance_x, spectra.variance_y)
+    def linearised(x: _Numbers, variance_x: Float[np.ndarray, "record harmonic"]) -> _Linearised:
+        return _Linearised(of.recorded.at(own, x), weight, variance_x, spectra.variance_y)
 
-    noisy = around(spectra.x, _unknown_hum(of, spectra.x))
+    noisy = linearised(spectra.x, _unknown_hum(of, spectra.x))
     x = spectra.x + noisy.back(noisy.solved(of.terms(noisy.response.predicted)))
     share = signal_share(x, spectra.variance_x * spectra.variance_y / of.variance(own))
     # Without hum: it is no random error, and its size would hide that of the noise.
-    noise = around(x, spectra.variance_x)
+    noise = linearised(x, spectra.variance_x)
     quiet = noise._replace(variance_x=_unknown_hum(of, x))
     slopes = weight * quiet.response.slopes()
     of_signal = weight * of.recorded.at(own, x * share).slopes()

@@ -36,7 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.online.projection import Projection, Seen
+from etid.online.projection import BandSums, Projection
 from etid.precision import Module
 from etid.signals.harmonics import ALIASED
 from etid.signals.mains import MAINS, MULTIPLES
@@ -161,7 +161,7 @@ class Bands(Module):
 
     def measure(
         self,
-        seen: Seen,
+        sums: BandSums,
         noise: Float[Array, "lane band"],
         lacking: Float[Array, " lane"],
         offset: Float[Array, " lane"],
@@ -169,7 +169,7 @@ class Bands(Module):
         """Gains of one pulse at all electrodes, as if its amplitude had been constant.
 
         Args:
-            seen: The bands of the windows.
+            sums: The bands of the windows.
             noise: Variance of the noise in each band, relative to that of the quiet.
             lacking: (A − B) / A, for a pulse of amplitude A after one of amplitude B.
             offset: Offset of the converter [V].
@@ -177,14 +177,14 @@ class Bands(Module):
         Returns:
             Ĝ in each band, with the phase of the trigger delay, and the weight of |Ĝ − G|².
         """
-        gain = seen.gain()
-        tail = self._lacking_tail(seen, lacking, offset)
+        gain = sums.gain()
+        tail = self._lacking_tail(sums, lacking, offset)
         unsure = self.weight[None, :] * power(0.2 * tail) / 2  # a fifth of the tail
-        weight = self.weight[None, :] / (seen.variance[:, None] * noise + unsure)
+        weight = self.weight[None, :] / (sums.variance[:, None] * noise + unsure)
         return gain + tail, weight
 
     def _lacking_tail(
-        self, seen: Seen, lacking: Float[Array, " lane"], offset: Float[Array, " lane"]
+        self, sums: BandSums, lacking: Float[Array, " lane"], offset: Float[Array, " lane"]
     ) -> Complex[Array, "lane band"]:
         """What the tail of the pulse before would add to the gain in the steady state.
 
@@ -192,7 +192,7 @@ class Bands(Module):
         of the tail that is left after one period.
         """
         last, middle = round(LAST * self.samples), self.samples // 2
-        means = seen.means()
+        means = sums.means()
         late = means.late - offset
         left = late / (1 - lacking * self.tail_left)
         # The rate of the loaded driver, as far as the noise lets it be seen.
@@ -200,7 +200,7 @@ class Bands(Module):
         decay = -jnp.log(self.tail_left) * (1 - (middle + last) / self.samples)
         ratio = early / late
         rate = jnp.log(jnp.where(ratio > 1, ratio, 1.0)) / decay - 1
-        noise = seen.variance / self.samples / last * (1 / early**2 + 1 / late**2) / decay**2
+        noise = sums.variance / self.samples / last * (1 / early**2 + 1 / late**2) / decay**2
         rate = rate * TAIL_SPREAD**2 / (TAIL_SPREAD**2 + noise)
         rate = jnp.where((ratio > 1) & jnp.isfinite(rate), rate, 0.0)
         shape = self.tail[0][None, :] + as_complex(rate)[:, None] * self.tail[1][None, :]
@@ -323,7 +323,7 @@ def unloaded_bands(
     hum = centre * sample_rate / size < (MULTIPLES + 0.5) * max(MAINS)
     level, by_band = size * sigma_th**2, np.ones(len(wide))
     if len(windows) - len(found) >= FREE:
-        level = float(whole.seen(windows, np.array([-np.inf, np.inf])).variance.mean())
+        level = float(whole.band_sums(windows, np.array([-np.inf, np.inf])).variance.mean())
         rest = summed((y - design @ found) * x.conj())
         squares = np.sum(np.abs(rest) ** 2, axis=0) / (len(windows) - len(found))
         by_band = _smoothed(np.maximum(squares / strength, whole.floor) / level, hum)

@@ -25,13 +25,13 @@ from etid.signals.harmonics import ALIASED
 TOGETHER = 50  # electrodes whose samples fit in the cache of a core and are read only once
 
 
-class Seen(NamedTuple):
+class BandSums(NamedTuple):
     """What one pulse shows at all electrodes, before its amplitude is considered.
 
     Few arrays reach the compiled program faster than many.
 
     Attributes:
-        sums: Real and imaginary part of Ĝ in each band for the samples as they are, and the means
+        values: Real and imaginary part of Ĝ in each band for the samples as they are, and the means
             of `Means`. Ĝ includes the phase of the delay.
         variance: E|noise|² of a Fourier coefficient of V_out [V²].
         clipped: Whether a sample reached the end of the converter's range.
@@ -39,19 +39,19 @@ class Seen(NamedTuple):
             by itself.
     """
 
-    sums: Float[Array | np.ndarray, "lane sum"]
+    values: Float[Array | np.ndarray, "lane sum"]
     variance: Float[Array | np.ndarray, " lane"]
     clipped: Bool[Array | np.ndarray, " lane"]
     repeated: Bool[Array | np.ndarray, " lane"]
 
     def gain(self) -> Complex[Array, "lane band"]:
         """Ĝ."""
-        parts = jnp.asarray(self.sums[:, : -len(Means._fields)], float)
+        parts = jnp.asarray(self.values[:, : -len(Means._fields)], float)
         return jax.lax.complex(*jnp.split(parts, 2, axis=1))
 
     def means(self) -> "Means":
         """The means."""
-        return Means(*jnp.asarray(self.sums[:, -len(Means._fields) :], float).T)
+        return Means(*jnp.asarray(self.values[:, -len(Means._fields) :], float).T)
 
 
 class Means(NamedTuple):
@@ -139,9 +139,9 @@ class Projection:
         within, rows = self.within.astype(np.float32), self.rows.astype(np.float32)
         return dataclasses.replace(self, within=within, rows=rows)
 
-    def seen(
+    def band_sums(
         self, v_out: Float[np.ndarray, "lane sample"], adc_range: Float[np.ndarray, " 2"]
-    ) -> Seen:
+    ) -> BandSums:
         """Bands and noise of one pulse.
 
         Args:
@@ -169,7 +169,9 @@ class Projection:
                 near = v_out[at]
                 at[at] = (near.min(axis=1) <= low) | (near.max(axis=1) >= high)
         variance = self.samples * np.concatenate(squares) / self.freedom()
-        return Seen(np.concatenate(found), np.maximum(variance, self.floor), at, np.zeros_like(at))
+        return BandSums(
+            np.concatenate(found), np.maximum(variance, self.floor), at, np.zeros_like(at)
+        )
 
     def _condensed(
         self, samples: Float[np.ndarray, "lane sample"]

@@ -17,20 +17,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit, impedance_at, with_slopes
-from etid.circuits.directions import At, spread
+from etid.circuits.directions import DIRECTIONS, ON_LOADS, At, spread
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import source_of
 from etid.estimators.unknowns import LoadUnknowns
 from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.online.gain_bands import Bands
 from etid.online.noise import cleared
-from etid.precision import Module, namespace
+from etid.precision import Module, array_function, namespace
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import (
     AnyArray,
     as_complex,
     combined,
-    frequency_variable,
     from_parts,
     power,
     reciprocal,
@@ -134,11 +133,14 @@ class GainModel(Module):
         by_fault = self._by_fault(gain)
         return found + from_parts(self.faults @ by_fault.real, self.faults @ by_fault.imag)
 
+    @array_function
     def _by_fault(self, gain: Complex[AnyArray, "*row band"]) -> Complex[AnyArray, "*row 3 band"]:
-        # ∂G/∂C = −s Z_L² ∂G/∂Z_L
-        by_capacitance = -frequency_variable(self.bands.frequency) * self.source * gain**2
-        xp = namespace(gain)
-        return xp.stack([gain, xp.ones_like(gain), by_capacitance], -2)
+        """Changes of a gain by each error of the instrument that acts on loads."""
+        left, by_z = 1 - gain, (1 - gain) ** 2 * reciprocal(self.source)
+        z = self.source * gain * reciprocal(left)
+        at = At(self.bands.frequency, z, gain[..., None, :], by_z[..., None, :])
+        each = [DIRECTIONS[name].change(at)[..., 0, :] for name in ON_LOADS]
+        return namespace(gain).concatenate(each, -2)
 
     def expected(self, logs: Float[AnyArray, "*row element"]) -> "Expected":
         """The gain of a load, and its derivatives."""

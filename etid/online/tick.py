@@ -18,7 +18,7 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.online.alarms import Innovation, PulseScores, averaged, driver_change
 from etid.online.gain_bands import Bands
 from etid.online.noise import Noise, cleared, directions
-from etid.online.projection import Seen
+from etid.online.projection import BandSums
 from etid.online.pulse_fit import (
     DELAYS,
     SETTLED,
@@ -125,7 +125,7 @@ def updated(
     noise: Noise,
     number: Int[Array, ""],
     driver_changed: Bool[Array, ""],
-    seen: Seen,
+    sums: BandSums,
     amplitude: Float[Array, " lane"],
 ) -> tuple[ElectrodeState, Noise, Int[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
     """The fields of `TrackerState` after one more pulse, without its windows.
@@ -138,12 +138,12 @@ def updated(
         noise: Noise before the pulse.
         number: Number of the pulse before.
         driver_changed: Whether any pulse before showed a change of the driver.
-        seen: What the windows show.
+        sums: What the windows show.
         amplitude: Relative amplitude of the pulse.
     """
     number = number + 1
     powers = jnp.asarray(model.circuit.scaling()[0])  # also how a change of Z_th moves the elements
-    measured = measured_pulse(model.bands, seen, amplitude, before, noise)
+    measured = measured_pulse(model.bands, sums, amplitude, before, noise)
     information = jax.vmap(lambda of: predicted(of, change))(before.information)
     logs = LoadUnknowns.of(before.own).log_elements
     expected = _expected(model, logs, number)
@@ -166,7 +166,7 @@ def updated(
     # the hum that it shows, the pulse must fit its prediction.
     def heard(noise: Noise) -> tuple[Measured, Attempt, Noise]:
         known = jax.vmap(partial(noise_after, model.bands.hum))(noise, measured, found)
-        other = measured_pulse(model.bands, seen, amplitude, before, known)
+        other = measured_pulse(model.bands, sums, amplitude, before, known)
         fit = jax.vmap(tracked)(logs, other, expected, information)
         known = dataclasses.replace(known, residual=fit.residual)
         fits = ~suspect(before, fit, information).jump
@@ -224,7 +224,7 @@ def _expected(
 
 def measured_pulse(
     bands: Bands,
-    seen: Seen,
+    sums: BandSums,
     amplitude: Float[Array, " lane"],
     before: ElectrodeState,
     noise: Noise,
@@ -234,13 +234,13 @@ def measured_pulse(
     known = jnp.isfinite(before.amplitude)
     lacking = jnp.where(known, (relative - before.amplitude) / relative, 0.0)
     # In the steady state the mean of V_out is 0: a transformer passes no direct voltage.
-    mean = seen.means().whole
-    finite = jnp.isfinite(mean) & jnp.isfinite(seen.variance)
+    mean = sums.means().whole
+    finite = jnp.isfinite(mean) & jnp.isfinite(sums.variance)
     steady = jnp.abs(lacking) < STEADY
     offset = jnp.where(finite & steady, mean, before.offset)
     unknown = ~jnp.isfinite(offset)
-    gain, weight = bands.measure(seen, noise.bands, lacking, jnp.where(unknown, 0.0, offset))
-    variance = jnp.asarray(seen.variance)
+    gain, weight = bands.measure(sums, noise.bands, lacking, jnp.where(unknown, 0.0, offset))
+    variance = jnp.asarray(sums.variance)
     signal = power(gain) @ bands.weight
     power_of_noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * variance
     flat = (signal < 4 * power_of_noise) | ~(amplitude > 0)
@@ -255,7 +255,7 @@ def measured_pulse(
             (repeated, RESULTS.repeated),
             (unconnected, RESULTS.unconnected),
         )
-    )(finite, seen.clipped, unknown, flat, seen.repeated, jnp.abs(level - 1) < 1 - OPEN)
+    )(finite, sums.clipped, unknown, flat, sums.repeated, jnp.abs(level - 1) < 1 - OPEN)
     return Measured(
         gain=gain * as_complex(1 / relative)[:, None],
         variance=variance / relative**2,
@@ -265,7 +265,7 @@ def measured_pulse(
         amplitude=amplitude,
         offset=offset,
         steady=steady,
-        repeated=jnp.asarray(seen.repeated),
+        repeated=jnp.asarray(sums.repeated),
         bad=bad,
     )
 

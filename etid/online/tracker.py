@@ -345,8 +345,8 @@ class Tracker(Overviewed, Kept):
             )
         relative = for_each("amplitude", amplitude, self.electrodes)
         old = state.windows.repeated(v_out, int(state.number) + 1)
-        seen = self.projection.seen(v_out.astype(float, copy=False), self.adc_range)
-        seen = seen._replace(repeated=old)
+        sums = self.projection.band_sums(v_out.astype(float, copy=False), self.adc_range)
+        sums = sums._replace(repeated=old)
         before, number, changed = state.electrodes, state.number, state.driver_changed
         electrodes, noise, number, event, changed = updated(
             self.model,
@@ -356,7 +356,7 @@ class Tracker(Overviewed, Kept):
             state.noise,
             number,
             changed,
-            seen,
+            sums,
             relative,
         )
         return TrackerState(electrodes, noise, number, event, changed, state.windows)
