@@ -308,6 +308,16 @@ def second(amplitude: float, t: np.ndarray) -> np.ndarray:
     return amplitude * filtered(t, lambda s: 20e3 / (1 + 2e-4 * s))
 
 
+@pytest.mark.parametrize("seed", [1, 7])
+def test_a_search_along_an_unseen_fall_turns_not_back_and_forth(seed):
+    """Without second derivatives of I_0 its steps are twice too long: 500 of them, and no end."""
+    rng = np.random.default_rng([seed, 11])
+    exact = [(linear(one, AT), one * pulses(AT)) for one in (1e-4, 5e-4, 5e-4)]
+    fit = etid.identify_amplitudes([recorded(*one, 1e-2, rng) for one in exact], throw=False)
+    assert fit.verdict in ("insensitive", "misfit")
+    assert int(fit.steps) < 60  # 100 draws take 27 at most
+
+
 @pytest.mark.slow
 def test_linear_skin_is_called_nonlinear_as_rarely_as_stated(monkeypatch):
     """1 of 2 000 by the limit; of 100, more than one would come by chance once in 800 times."""

@@ -14,7 +14,7 @@ from etid.signals.transfer import power
 
 # Reductions of ½ Σ r² that are enough: first as a part of it; then that of 0.01 standard errors.
 COARSE, FINE = 1e-3, 5e-5
-DAMPING, STEPS = 1e-2, 500
+DAMPING, STEPS = 1e-2, 200
 
 
 def fit_amplitudes(of: Amplitudes) -> tuple[Estimate, bool]:
