@@ -19,9 +19,7 @@ from jaxtyping import Bool, Float
 import etid
 from benchmarks.rates import Rate, rate
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.estimators.registry import named, names
-from etid.identify.options import for_calibrations
-from etid.recordings.preflight import Inspected
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named, names
 from etid.results.driver import Order
 from etid.results.verdicts import counted
 
@@ -120,15 +118,13 @@ class Drivers:
         self.known: dict[tuple, etid.Driver | None] = {}
         self.times: dict[str, list[float]] = {}
 
-    def kind(self, calibrations: Sequence[etid.Recording], name: str) -> str:
-        """The method that identifies the driver: on the harmonics, that of maximum likelihood."""
-        if name == DEFAULT:
-            name = str(for_calibrations(None, [Inspected.of(record) for record in calibrations]))
-        return "maximum_likelihood" if named(name).lane.periodic else name
+    def kind(self, name: str) -> str:
+        """The method that identifies the driver."""
+        return str(MAXIMUM_LIKELIHOOD if name == DEFAULT else named(name))
 
     def of(self, calibrations: Sequence[etid.Recording], name: str) -> etid.Driver | None:
         """The driver for a method, whatever its verdict; None if a calibration is refused."""
-        kind = self.kind(calibrations, name)
+        kind = self.kind(name)
         samples = (of for record in calibrations for of in record.samples.values())
         sums = (zlib.crc32(of.stored.tobytes()) for of in samples)
         key = kind, *sums, *(record.metadata for record in calibrations)

@@ -125,7 +125,7 @@ class Result(NamedTuple):
 def ours(draws: Draws, drivers: Drivers, name: str) -> Iterator[Result]:
     """One of our estimators, alone and batched; after its budget other draws are left out."""
     method, begin = method_of(name), np.inf
-    kind, default = (drivers.kind([draws.studies[0][CALIBRATION]], of) for of in (name, DEFAULT))
+    kind, default = map(drivers.kind, (name, DEFAULT))
     on_harmonics = kind == "maximum_likelihood"
     budget = np.inf if on_harmonics or kind == default else BUDGET
     answers, usable, times = [], [], []

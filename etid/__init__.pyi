@@ -22,7 +22,7 @@ from .circuits.netlist import circuit_string as circuit_string
 from .circuits.netlist import netlist as netlist
 from .estimators.estimator import AbstractEstimator as AbstractEstimator
 from .estimators.maximum_likelihood.estimator import MaximumLikelihood as MaximumLikelihood
-from .estimators.output_error.estimator import OutputError as OutputError
+from .estimators.output_error import OutputError as OutputError
 from .estimators.registry import register as register
 from .estimators.steiglitz_mcbride.estimator import EquationError as EquationError
 from .estimators.steiglitz_mcbride.estimator import SteiglitzMcBride as SteiglitzMcBride

@@ -3,12 +3,15 @@
 Precision is float64. NaN and infinity are results here: elements of a fit that failed have no
 number, and its verdict says why. So `jax_debug_nans` and `jax_debug_infs` do not look into etid.
 
-Formulas compute in the namespace of their arrays, NumPy or JAX.
+Formulas compute in the namespace of their arrays, NumPy or JAX. OpenBLAS shares a product of a few
+thousand multiplications among threads. Those then wait for the next product in a busy loop, which
+takes three quarters of the CPU time of a driver. So fits by NumPy run in `one_thread`.
 """
 
+import contextlib
 import functools
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
@@ -17,6 +20,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -24,6 +28,8 @@ Tree = TypeVar("Tree")
 
 _NUMPY = (np.ndarray, np.generic, float, int, complex)
 _INSIDE = threading.local()  # whether a thread runs an array function
+_lock, _inside = threading.Lock(), 0  # number of callers that have set BLAS to one thread
+_limits: list[Any] = []
 
 
 def namespace(*values: Any) -> ModuleType:
@@ -32,6 +38,28 @@ def namespace(*values: Any) -> ModuleType:
         if not isinstance(one, _NUMPY):
             return jnp
     return np
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """BLAS has one thread within, and after the last of several callers as many as before."""
+    global _inside
+    with _lock:
+        if _inside == 0:
+            _limits.append(_blas().limit(limits=1))
+        _inside += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _inside -= 1
+            if _inside == 0:
+                _limits.pop().__exit__(None, None, None)
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController().select(user_api="blas")
 
 
 def array_function(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

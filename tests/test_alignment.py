@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.estimators.lanes import Harmonics, PaddedSamples
+from etid.estimators.lanes import Bins, Harmonics
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.lags import lags_of, whole_lag
@@ -84,15 +84,14 @@ def test_what_is_fitted_does_not_depend_on_whole_samples(late):
     harmonic, right = Harmonics.of(there), Harmonics.of(Inspected.of(here))
     step = 10 / 2**15 / 0.0535  # rounding of two records, shared by 10 000 samples
     np.testing.assert_allclose(harmonic.y, right.y, atol=6 * step / np.sqrt(10_000))
-    padded = PaddedSamples.of(there)
-    v_th, v_out, size = padded.v_th, padded.v_out, padded.samples
-    assert size == 10_000 - abs(late)
-    begin = max(0, -late)
-    np.testing.assert_array_equal(v_th[:size], here.v_th[begin : begin + size])
-    np.testing.assert_allclose(v_out[:size], here.v_out[begin : begin + size], atol=1.01 * step)
-    assert not v_out[size:].any()
-    assert padded.harmonics is not None
-    np.testing.assert_array_equal(padded.harmonics.y, harmonic.y)
+    v_th, v_out = there.aligned
+    begin, size = max(0, -late), 10_000 - abs(late)
+    np.testing.assert_array_equal(v_th, here.v_th[begin : begin + size])
+    np.testing.assert_allclose(v_out, here.v_out[begin : begin + size], atol=1.01 * step)
+    bins, samples = Bins.of(there), here.v_th[begin : begin + size]
+    expected = np.fft.rfft(samples)[1 : bins.size + 1] / size
+    used = np.flatnonzero(bins.selected)
+    np.testing.assert_allclose(np.asarray(bins.x)[used], expected[used], atol=1e-12)
 
 
 def test_elements_are_those_without_the_delay(driver):

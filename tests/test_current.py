@@ -93,7 +93,7 @@ def test_a_prior_is_one_more_measurement(skin):
 
 def test_a_single_pulse_is_identified_in_time():
     fit = etid.identify_skin(recorded(SKIN, periods=1.1, delay=5e-7))
-    assert fit.method == "output_error"
+    assert fit.method == "maximum_likelihood"
     assert np.abs(off(fit, SKIN)).max() < WITHIN
     kept_numbers.check("current_in_time", kept_numbers.of_fit(fit))
 

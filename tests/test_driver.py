@@ -7,10 +7,8 @@ from jax.flatten_util import ravel_pytree
 from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
 from etid.circuits.impedance import realise
 from etid.estimators.refined_driver import is_split
-from etid.results.driver import ContinuousDriver
 from etid.results.feed import SourceImpedance, loaded
 from etid.signals.transfer import frequency_variable
-from tests import pictures
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
 S = np.asarray(frequency_variable(FREQUENCY))
@@ -118,10 +116,3 @@ def test_sections_in_one_place_are_one_that_is_split(omega, zeta, split):
     logs = jnp.log(jnp.array(omega)), jnp.log(jnp.array(zeta))
     source = SourceImpedance(jnp.zeros(()), *logs, gain, gain, jnp.zeros(1), jnp.ones(1))
     assert bool(is_split(source)) == split
-
-
-def test_a_delay_of_the_calibration_has_more_samples_at_a_higher_rate():
-    driver = pictures.driver()
-    assert isinstance(driver, ContinuousDriver)
-    seconds = float(driver.calibration.delay_std_samples) / float(driver.sample_rate)
-    assert float(driver.late_std(jnp.asarray(1e6))) == pytest.approx(1e6 * seconds)

@@ -62,7 +62,7 @@ def added(z, current, every):
     at = z[every.index]
     one = np.ones((1, at.size), complex)
     slopes = Slopes(at, at[None], one, one, one[None])
-    profile: Any = SimpleNamespace(x=current)
+    profile: Any = SimpleNamespace(x=current, made=None)
     nothing: Any = None
     near = Near(np.zeros(1), np.zeros(()), profile, nothing, slopes, None)
     return falling(near, every)

@@ -137,11 +137,12 @@ def unfitted(monkeypatch):
     """The lane that would be fitted to the arrays of a recording."""
     lanes = []
 
-    def seen(lane, *_):
+    def seen(_, lane, *of):
+        del of
         lanes.append(lane)
         raise InterruptedError  # its fit is not needed
 
-    monkeypatch.setattr(samples, "skin_lane", seen)
+    monkeypatch.setattr(MaximumLikelihood, "fit_load", seen)
     driver = object.__new__(HarmonicDriver)  # whose numbers nobody reads
     monkeypatch.setattr(samples, "_may_share", lambda *_: False)
     for name in ("known", "check_driver"):

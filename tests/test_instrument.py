@@ -179,7 +179,6 @@ def test_a_fit_names_the_error_that_nobody_stated_and_that_exceeds_its_errors_mo
     stated = fitted(calibration, skin, dataclasses.replace(ALL, drift=0.01))
     assert stated.by_tolerance is not None
     assert {*stated.by_tolerance.unstated} == {"later gain"}
-    assert "Not in ±" not in str(etid.identify_skin(skin, driver, method="output_error"))
 
 
 def test_the_parts_of_a_budget_are_the_variances_of_the_fit():

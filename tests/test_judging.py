@@ -21,7 +21,6 @@ from etid.estimators.judgement import (
     too_late,
     unless,
 )
-from etid.estimators.output_error.estimator import INTERPOLATED
 from etid.likelihood.linear import NormalEquations
 from etid.recordings.remarks import Remark
 from etid.results.verdicts import RESULTS, verdict
@@ -69,15 +68,6 @@ def name(of, driver=SUCCESSFUL):
 def test_a_misfit_exceeds_the_noise_in_standard_deviations_and_in_volts(chi2, error, expected):
     assert bool(misses(jnp.asarray(chi2), jnp.asarray(error))) is expected
     assert name(estimate(chi2=chi2, rrse=error)) == ("misfit" if expected else "successful")
-
-
-def test_what_a_residual_may_leave_unexplained_depends_on_the_method():
-    """Output error at 100 kHz and 80 dB: R_s was ten standard errors off and called successful."""
-    of = jnp.asarray(4.5), jnp.asarray(6.7e-4)
-    assert not misses(*of)
-    assert misses(*of, INTERPOLATED)
-    # At 200 kHz, where it is right.
-    assert not misses(jnp.asarray(1.43), jnp.asarray(2.9e-4), INTERPOLATED)
 
 
 @pytest.mark.parametrize(

@@ -105,9 +105,9 @@ def test_all_functions_of_studies_take_the_same_options(study, source, fitted):
 
 def test_a_tolerance_that_no_fit_would_contain_is_refused(source, tmp_path, capsys):
     target = tmp_path / "fits.h5"
-    command = ["fit", str(source), "-o", str(target), "--method", "output_error"]
+    command = ["fit", str(source), "-o", str(target), "--method", "steiglitz_mcbride"]
     assert cli.main([*command, "--tolerance", "r_load=0.01"]) == 1
-    assert "are parameters of maximum likelihood" in capsys.readouterr().err
+    assert "enter standard errors" in capsys.readouterr().err
     assert not target.exists()
 
 

@@ -56,7 +56,7 @@ def test_a_recording_of_its_current_is_identified(recorded):
         sample_rate=SAMPLE_RATE,
         pulse_rate=SAMPLE_RATE / t.size,
     )
-    fit = etid.identify_skin(recording, method="output_error", throw=False)
+    fit = etid.identify_skin(recording, throw=False)
     assert abs(float(fit.circuit.r_p) / 500e6 - 1) < 0.01  # the maker's tolerances
     assert abs(float(fit.circuit.c_p) / 33e-12 - 1) < 0.10
     assert fit.verdict == "misfit"

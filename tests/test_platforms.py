@@ -1,25 +1,22 @@
 """The programs of batches are lowered for GPUs too: no operation of theirs is missing there."""
 
-import contextlib
-
+import jax
 import pytest
 
 import etid
-from etid.identify import fitting
-from etid.numpy_tier import tiers
+from etid.estimators.lanes import stacked
+from etid.estimators.registry import named
+from etid.identify.fitting import known_of
+from etid.recordings.preflight import Inspected
 from etid.simulation import scenes
 
 # The estimators of batches, and those that identify their drivers.
 DRIVERS = {
     "maximum_likelihood": "maximum_likelihood",
-    "output_error": "output_error",
+    "output_error": "maximum_likelihood",
     "steiglitz_mcbride": "steiglitz_mcbride",
     "equation_error": "steiglitz_mcbride",
 }
-
-
-class _Lowered(BaseException):
-    """A program was lowered. It need not be compiled and run: that takes ten times as long."""
 
 
 @pytest.fixture(scope="module")
@@ -37,31 +34,17 @@ def drivers(study):
     }
 
 
-@pytest.fixture
-def lowered(monkeypatch):
-    """Runs code until it has lowered a program with this name, for CUDA."""
-    compiled, awaited = tiers._by_xla, []
-
-    def by_xla(run, *args):
-        if run.__name__ in awaited:
-            run.trace(*args).lower(lowering_platforms=("cuda",))
-            raise _Lowered
-        return compiled(run, *args)
-
-    @contextlib.contextmanager
-    def until(name):
-        awaited.append(name)
-        with pytest.raises(_Lowered):
-            yield
-
-    monkeypatch.setattr(tiers, "_by_xla", by_xla)
-    return until
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("method", DRIVERS)
-def test_a_batch_is_lowered_for_cuda(lowered, study, drivers, method, monkeypatch):
-    monkeypatch.setattr(fitting, "ROWS", False)  # accelerators run programs of JAX
-    driver = drivers[DRIVERS[method]]
-    with lowered("_chunk"):
-        etid.identify_skins(study.loaded, driver, method=method)
+def test_a_batch_is_lowered_for_cuda(study, drivers, method):
+    driver, estimator, circuit = drivers[DRIVERS[method]], named(method), etid.SkinRC()
+    seen = [Inspected.of(one) for one in list(study.loaded.recordings())[:2]]
+    lanes = [estimator.lane_of(one).of(one) for one in seen]
+    known = known_of(lanes[0], driver, False, estimator)
+
+    def fits(lanes):
+        fit = jax.vmap(lambda lane: estimator.fit_load(lane, driver, known, circuit))(lanes)
+        return fit.circuit, fit.cov, fit.chi2
+
+    traced = jax.jit(fits).trace(jax.tree.map(jax.device_put, stacked(lanes)))
+    assert "func" in traced.lower(lowering_platforms=("cuda",)).as_text()

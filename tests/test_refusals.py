@@ -70,8 +70,7 @@ etid.Instrument(gain=-1e-3) -> gain
 etid.Instrument(capacitance=5.0) -> \[F\]
 etid.Instrument(r_load=5.0) -> relative
 etid.Instrument(c_load=5.0) -> \[F\]
-etid.identify_driver(of.calibration, instrument=GAIN, method='output_error') -> output_error
-etid.identify_skin(of.skin, of.tolerant, method='output_error') -> output_error
+etid.identify_driver(of.calibration, instrument=GAIN, method='equation_error') -> equation_error
 etid.identify_driver(of.calibration, method='steiglitz_mcbride(steps=3)') -> has no such options
 etid.identify_driver(of.calibration, method='steiglitz_mcbride(iterations=0)')
     -> has no such options
@@ -139,7 +138,8 @@ of.controller.command(of.state, current=np.array([0.0001, 0.006])) -> is wanted;
 etid.identify_study(of.study, order=1) -> order: is 1, must be
 etid.identify_jointly(of.study, order=21) -> order: is 21, must be
 etid.fit_file('absent.h5', 'fits.h5', order=1) -> order: is 1, must be
-etid.identify_study(of.study, order='auto', method='output_error') -> needs maximum likelihood
+etid.identify_study(of.study, order='auto', method='equation_error')
+    -> needs maximum likelihood
 etid.identify_driver(of.calibration, plausible=(3e5, 3e2)) -> plausible: is \(300000\.0, 300\.0\),
 etid.identify_study(of.study, plausible=(-1.0, 3e2)) -> plausible: is \(\-1\.0, 300\.0\), must be
 etid.identify_jointly(of.study, plausible=(1.0, np.nan)) -> plausible: is \(1\.0, nan\), must be

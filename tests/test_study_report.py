@@ -437,9 +437,6 @@ CITED = {  # what a reader sees, and the key of the entry that it must have
 }
 
 
-TWO = "maximum_likelihood + output_error"
-
-
 def test_the_methods_are_told_in_120_words_and_in_full_behind_them(found, study_file, page):
     section = methods.methods_section(found)
     assert len(section.text.split()) <= 120
@@ -471,7 +468,7 @@ def test_the_budget_is_that_of_the_fit_with_the_median_error(tmp_path):
         assert budgets(found, None) == []
 
 
-@pytest.mark.parametrize("method", ["maximum_likelihood", "output_error", "joint", TWO])
+@pytest.mark.parametrize("method", ["maximum_likelihood", "output_error", "joint"])
 def test_methods_of_fits_from_a_current_tell_of_no_driver(found, method):
     fits = dataclasses.replace(found.fits, fit=dataclasses.replace(found.fits.fit, method=method))
     by_current = dataclasses.replace(found, fits=fits, drivers={}, failures={})
@@ -499,12 +496,12 @@ def test_methods_count_the_calibrations(found):
         assert words in section.details
 
 
-@pytest.mark.parametrize("method", [*registry.names(), "joint", "online", TWO])
+@pytest.mark.parametrize("method", [*registry.names(), "joint", "online"])
 def test_methods_cite_what_they_name_and_say_the_settings(found, method):
     fit = dataclasses.replace(found.fits.fit, method=method)
     settings = dataclasses.replace(found.settings, order=4)
     told = etid.Instrument(gain=1e-3, r_load=1e-3).as_arrays()
-    by = method.partition(" + ")[0]
+    by = method
     drivers = {
         paths: dataclasses.replace(driver, method=by, instrument=told)
         for paths, driver in found.drivers.items()

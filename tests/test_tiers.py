@@ -20,24 +20,7 @@ from etid.estimators.lanes import unstacked
 from etid.numpy_tier import tiers
 from etid.numpy_tier.tiers import program
 
-# Both round each of some thousand operations, and the condition of the equations (up to 1e10)
-# amplifies this. A ten-thousandth of a standard error is above that, and nobody can see it.
-OF_ERRORS = 1e-4
-
-
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
-
-@pytest.fixture
-def by_xla(monkeypatch):
-    """A function whose calls are compiled."""
-
-    def by_xla(call):
-        with monkeypatch.context() as patch:
-            patch.setattr(tiers, "_by_numpy", lambda: False)
-            return call()
-
-    return by_xla
 
 
 @pytest.fixture(scope="module")
@@ -49,44 +32,6 @@ def studies():
         for name, scene in scenes.items()
         for snr in (60.0, 25.0)
     }
-
-
-def same_fit(one, other):
-    assert (one.verdict, int(one.remarks)) == (other.verdict, int(other.remarks))
-    values = np.stack([np.asarray(of.circuit.values()) for of in (one, other)])
-    stderr = np.sqrt(np.diagonal(np.asarray(other.cov)))
-    known = np.isfinite(stderr) & (stderr > 0)
-    determined = known & (stderr < abs(values[1]))
-    limits = stderr * np.where(determined, OF_ERRORS, 100 * OF_ERRORS)
-    assert (abs(values[0][known] - values[1][known]) <= limits[known]).all()
-    if one.verdict == "successful":  # else an element may be 1e-290: nothing but rounding
-        np.testing.assert_allclose(values[0][~known], values[1][~known], rtol=1e-6)
-    # Where an element is not determined, even the size of its error is by chance, and a little of
-    # this comes into the errors of the others: a ten-thousandth was seen.
-    of = np.ix_(determined, determined)
-    size = np.outer(stderr[determined], stderr[determined])
-    change = np.asarray(one.cov)[of] - np.asarray(other.cov)[of]
-    assert (abs(change) <= (1e-5 if one.verdict == "successful" else 1e-3) * size).all()
-    np.testing.assert_allclose(one.chi2, other.chi2, rtol=1e-7)
-
-
-def test_drivers_and_skins_are_those_of_xla(studies, by_xla):
-    for study in studies.values():
-        calibration = next(one for path, one in study.items() if "calibration" in path)
-        loaded = next(iter(study.loaded.recordings()))
-
-        def driver(calibration=calibration):
-            return etid.identify_driver(calibration, throw=False)
-
-        one, other = driver(), by_xla(driver)
-        assert (one.verdict, int(one.remarks)) == (other.verdict, int(other.remarks))
-        frequency = jnp.geomspace(100.0, 1e5, 30)
-        np.testing.assert_allclose(one.response(frequency), other.response(frequency), rtol=1e-7)
-
-        def skin(loaded=loaded, driver=other):
-            return etid.identify_skin(loaded, driver, throw=False)
-
-        same_fit(skin(), by_xla(skin))
 
 
 COUNTED = """
@@ -152,8 +97,9 @@ study = etid.scenes.paper_dry(current_snr_db=60.0, samples=3334).simulate(seed=0
 calibration, one = study["calibration/98k8"], study["typical/dry/01"]
 ran("current", etid.identify_skin(one, throw=False))
 ran("current behind a driver", etid.identify_skin(one, driver, throw=False))
-in_time = etid.identify_driver(calibration, method="output_error", throw=False)
-ran("output error", etid.identify_skin(one, in_time, method="output_error", throw=False))
+single = etid.identify_driver(calibration, throw=False)
+ran("a single period", etid.identify_skin(one, single, throw=False))
+ran("output error", etid.identify_skin(one, single, method="output_error", throw=False))
 """
 
 
@@ -183,7 +129,7 @@ def test_the_example_of_the_readme_and_ten_recordings_with_their_report_compile_
 @pytest.mark.slow
 def test_no_small_work_compiles_anything(tmp_path):
     found = compiled(OTHERS, tmp_path)
-    assert len(found) == 20
+    assert len(found) == 21
     assert not any(found.values()), found
 
 
@@ -325,40 +271,3 @@ def test_a_long_compilation_is_announced_once_on_a_terminal_and_not_in_a_file(
         for _ in range(2):
             function(jnp.zeros(3))
     assert screen.getvalue().count("JAX compiles") == terminal
-
-
-CIRCUITS = etid.SkinLayers(), etid.ParallelRC(), etid.SkinCole(), etid.Resistor()
-METHODS = "steiglitz_mcbride", "equation_error", "output_error"
-OPTIONS = (
-    {},
-    *({"circuit": circuit} for circuit in CIRCUITS),
-    *({"prior": {"r_s": (3e4, 1e3)}}, {"fixed": {"r_s": 3.3e4}}),
-    {"bounds": {"r_s": (1e3, 3.3e4)}},
-    *({"method": method} for method in METHODS),
-)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", OPTIONS, ids=str)
-def test_drawn_recordings_by_all_methods_and_circuits_are_those_of_xla(options, by_xla):
-    """Dry and damp skin, 20 to 80 dB, with and without delays; several recordings of a driver."""
-    rng = np.random.default_rng(OPTIONS.index(options))
-    method = options.get("method")
-    in_time = method in METHODS
-    for scene in (etid.scenes.paper_dry, etid.scenes.paper_damp):
-        study = scene(
-            # Standard errors of output error at 28 dB move by 12 % between the instructions of two
-            # processors, with XLA alone: they are rounding errors of an ill-conditioned inverse.
-            snr_db=rng.uniform(50.0 if method == "output_error" else 20.0, 80.0),
-            trigger_jitter_rms=rng.choice([0.0, 100e-9]),
-            samples=3334 if method == "output_error" else 10_000,
-        ).simulate(seed=int(rng.integers(1000)))
-        calibration = next(one for path, one in study.items() if "calibration" in path)
-        by = method if in_time else None
-        driver = etid.identify_driver(calibration, method=by, throw=False)
-        for loaded in list(study.loaded.recordings())[:4]:
-
-            def skin(loaded=loaded, driver=driver):
-                return etid.identify_skin(loaded, driver, throw=False, **options)
-
-            same_fit(skin(), by_xla(skin))

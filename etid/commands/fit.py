@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=registry.names(),
-        help="default maximum_likelihood if the record allows it, else output_error",
+        help="default maximum_likelihood",
     )
     add_circuit(parser, "circuit of the loads, default SkinRC", automatic=True)
     parser.add_argument(

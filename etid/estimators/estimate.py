@@ -1,4 +1,4 @@
-"""Parts that all fits share: the solver, and the estimate that a fit returns."""
+"""The estimate that a fit returns."""
 
 import dataclasses
 
@@ -10,10 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from etid.precision import Module
 from etid.results.fit import Support
 from etid.results.instrument import Effects
-from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 MAX_STEPS = 500
-SOLVER = LevenbergMarquardt(rtol=1e-5, ftol=1e-6)  # 1e-3 standard errors at 10 000 samples
 
 
 class Estimate(Module):

@@ -10,12 +10,14 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators import judgement
-from etid.estimators.lanes import AbstractLane
+from etid.estimators.lanes import AbstractLane, stacked
+from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
@@ -124,8 +126,6 @@ class AbstractEstimator(abc.ABC):
         current: Whether the estimator identifies loads from a measured current, without a driver.
         any_circuit: Whether the estimator identifies circuits other than `SkinRC`.
         chooses: Whether its fits have a `support`, by which circuits can be compared.
-        rows: Whether NumPy runs `fit_driver` and `fit_rows` as they stand; if not, `fit_driver` and
-            `fit_load` are traced.
     """
 
     name: ClassVar[str]
@@ -134,7 +134,16 @@ class AbstractEstimator(abc.ABC):
     current: ClassVar[bool] = False
     any_circuit: ClassVar[bool] = True
     chooses: ClassVar[bool] = False
-    rows: ClassVar[bool] = False
+
+    def lane_of(self, seen: Inspected) -> type[AbstractLane]:
+        """The data of a recording that has passed the preflight checks."""
+        del seen
+        return self.lane
+
+    def lane_of_periods(self, periods: int) -> type[AbstractLane]:
+        """The data of bare arrays with so many whole periods."""
+        del periods
+        return self.lane
 
     @abc.abstractmethod
     def fit_driver(
@@ -156,9 +165,7 @@ class AbstractEstimator(abc.ABC):
 
     @abc.abstractmethod
     def fit_load(self, lane: Any, driver: Any, known: Any, circuit: AbstractCircuit) -> Fit:
-        """Identify a load.
-
-        The code must be differentiable. The caller compiles and batches it.
+        """Identify a load. JAX can transform the function.
 
         Args:
             lane: Data of one recording.
@@ -170,7 +177,7 @@ class AbstractEstimator(abc.ABC):
     def fit_rows(
         self, lanes: Sequence[AbstractLane], driver: Any, known: Any, circuit: AbstractCircuit
     ) -> list[Fit]:
-        """Identify the loads of several recordings, for estimators with `rows`.
+        """Identify the loads of several recordings.
 
         Args:
             lanes: Data of the recordings.
@@ -181,7 +188,8 @@ class AbstractEstimator(abc.ABC):
         Returns:
             The fits, stacked in parts.
         """
-        raise NotImplementedError
+        of = driver, known, circuit
+        return [stacked(jax.device_get([self.fit_load(lane, *of) for lane in lanes]))]
 
     @abc.abstractmethod
     def describe(self) -> Description:
@@ -222,7 +230,7 @@ class AbstractEstimator(abc.ABC):
             raise ValueError(
                 f"{self} needs recording and calibration at the same sample rate; the recording "
                 f"has {sample_rate:g} Hz and the driver {float(found.sample_rate):g} Hz; "
-                "use the method output_error"
+                "use the method maximum_likelihood"
             )
 
     def __str__(self) -> str:

@@ -1,20 +1,19 @@
 """Lanes: the arrays of a recording that an estimator fits, its harmonics or its samples.
 
-NumPy prepares them, because JAX would compile once for each length of a record. Records of most
-lengths have the same number of harmonics. Samples are padded to one of a few lengths. Many
-recordings therefore share one compiled function.
+NumPy prepares them. Records of most lengths have the same number of harmonics, so that they are
+rows of one call.
 """
 
 import abc
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several
@@ -22,14 +21,21 @@ from etid.precision import Module
 from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
-from etid.signals.harmonics import ALIASED, Spectrum, aliases, filled, harmonics, joins_aliases
-from etid.signals.lags import rest, shifted
+from etid.signals.harmonics import (
+    ALIASED,
+    Spectrum,
+    aliases,
+    filled,
+    harmonics,
+    harmonics_of,
+    joins_aliases,
+)
+from etid.signals.lags import rest
 from etid.signals.noise import Measurement, noise_of
 from etid.signals.rounding import rounding_variance
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
-LANES = 64  # lanes or circuits of one call; the last call is padded
-STEPS = 4  # lengths per octave; the padding is at most a fifth
+LANES = 64  # recordings that are fitted together
 
 
 class Lags(NamedTuple):
@@ -79,8 +85,8 @@ class AbstractLane(Module):
         return jax.tree.leaves(self)[0].shape[-1]
 
     @property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shapes of all arrays; lanes with the same shapes share a compiled function."""
+    def shapes(self) -> tuple[Any, ...]:
+        """Shapes of all arrays; lanes with the same shapes are rows of one call."""
         return tuple(leaf.shape for leaf in jax.tree.leaves(self))
 
     def realigned(self, late: Lags) -> "AbstractLane":
@@ -178,7 +184,7 @@ class Harmonics(AbstractLane):
     def fields(self) -> Spectrum:
         """The harmonics without the sample rate."""
         of = (self.frequency, self.x, self.y, self.variance_x, self.variance_y, self.selected)
-        return Spectrum(*of)
+        return Spectrum(*of, whole=self.periodic)
 
     @property
     def spectrum(self) -> Spectrum:
@@ -214,6 +220,47 @@ class Harmonics(AbstractLane):
         if not (self.selected & suspect).any():
             return None
         return dataclasses.replace(self, selected=self.selected & ~suspect)
+
+
+class Bins(Harmonics):
+    """The same of a record of any length and start: the bins of its own transform, but for bin 0.
+
+    The records are cut to their overlap, so that the frequencies depend on the lag.
+    """
+
+    periodic = False
+
+    @staticmethod
+    def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
+        """The fields of a lane, in their order."""
+        return *seen.bins.fields, np.asarray(seen.recording.sample_rate)
+
+    @classmethod
+    def of_first(cls, seen: Inspected, samples: int) -> "Bins":
+        """The lane of the first samples of the overlap."""
+        of = seen.bins_of_first(samples).fields
+        return cls(*[*of, np.asarray(seen.recording.sample_rate)])
+
+    @classmethod
+    def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "Bins":
+        """The bins of bare arrays."""
+        del periods
+        records, size = jnp.stack([m.v_th, m.v_out]), m.v_out.shape[0]
+        least = jnp.stack([m.sigma_th, m.sigma_out])[:, None] ** 2 / size
+        found = jax.vmap(lambda v: noise_of(v, 1, size, whole=False).variance)(records)
+        noise = jax.lax.stop_gradient(jnp.maximum(found, least))
+        count = math.ceil(ALIASED * size)
+        of = harmonics_of(records, 1)[:, :count], noise[:, :count]
+        return cls(*[*filled(*of, m.sample_rate, 1, size), m.sample_rate])
+
+    @property
+    def shapes(self) -> tuple[Any, ...]:
+        """The same, and the distance of two bins: rows of one call have equal frequencies."""
+        return *super().shapes, float(np.asarray(self.frequency).reshape(-1)[0])
+
+    def realigned(self, late: Lags) -> "Bins":
+        """Refused: samples at one end would have to come from the other."""
+        raise NotImplementedError("make the lane of the realigned recording")
 
 
 class HarmonicsWithCurrent(Harmonics):
@@ -273,7 +320,6 @@ class AlignedSamples(AbstractLane):
         sigma_th: Noise of `v_th` [V].
         sigma_out: Noise of `v_out` [V].
         sample_rate: Sampling rate [Hz].
-        samples: Number of recorded samples; zeros may follow them.
     """
 
     v_th: Float[Array | np.ndarray, "*lane time"]
@@ -281,7 +327,6 @@ class AlignedSamples(AbstractLane):
     sigma_th: Float[Array | np.ndarray, "*lane"]
     sigma_out: Float[Array | np.ndarray, "*lane"]
     sample_rate: Float[Array | np.ndarray, "*lane"]
-    samples: Int[Array | np.ndarray, "*lane"]
 
     @classmethod
     def of(cls, seen: Inspected) -> "AlignedSamples":
@@ -289,63 +334,17 @@ class AlignedSamples(AbstractLane):
         v_th, v_out = seen.aligned
         of_th, of_out = map(np.asarray, seen.trusted)
         rate = np.asarray(seen.recording.sample_rate)
-        return cls(v_th, v_out, of_th, of_out, rate, np.asarray(v_th.size))
+        return cls(v_th, v_out, of_th, of_out, rate)
 
     @classmethod
     def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "AlignedSamples":
         """The lane of bare arrays."""
         del periods
-        known = m.sigma_th, m.sigma_out, m.sample_rate
-        return cls(m.v_th, m.v_out, *known, jnp.asarray(m.v_out.shape[0]))
+        return cls(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate)
 
     def measure(self) -> Measurement:
         """Both records and their noise."""
         return Measurement(self.v_th, self.v_out, self.sigma_th, self.sigma_out, self.sample_rate)
-
-
-class PaddedSamples(AlignedSamples):
-    """The same, padded with zeros to one of a few lengths.
-
-    Attributes:
-        harmonics: Harmonics for a score test; None if the record does not hold whole periods.
-    """
-
-    harmonics: Harmonics | None = None
-
-    @classmethod
-    def of(cls, seen: Inspected) -> "PaddedSamples":
-        """The aligned samples of a recording."""
-        length = math.ceil(2 ** (math.ceil(STEPS * math.log2(seen.v_th.size)) / STEPS))
-        one = AlignedSamples.of(seen)
-        v_th, v_out = (np.pad(v, (0, length - one.size)) for v in (one.v_th, one.v_out))
-        known = one.sigma_th, one.sigma_out, one.sample_rate, one.samples
-        return cls(v_th, v_out, *known, Harmonics.of(seen) if seen.is_periodic else None)
-
-    def realigned(self, late: Lags) -> "PaddedSamples":
-        """The overlap of both records, with `v_out` advanced by whole samples."""
-        if late.v_out == 0:
-            return self
-        samples = int(self.samples)
-        v_th, v_out = (np.asarray(v)[:samples] for v in (self.v_th, self.v_out))
-        v_th, v_out = shifted(v_th, v_out, late.v_out)
-        room = (0, self.v_th.size - v_th.size)
-        return dataclasses.replace(
-            self,
-            v_th=np.pad(v_th, room),
-            v_out=np.pad(v_out, room),
-            samples=np.asarray(v_th.size),
-            harmonics=self.harmonics and self.harmonics.realigned(late),
-        )
-
-    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> Lags:
-        """Whole samples by which `v_out` is later than with this load; 0 if they are few."""
-        rate = self.sample_rate
-        frequency = np.fft.rfftfreq(self.v_th.size, 1 / rate)[1:]
-        x, y = np.fft.rfft(self.v_th)[1:], np.fft.rfft(self.v_out)[1:]
-        gain = _gain(circuit, driver, frequency)
-        # The weight emphasises the edges, like a derivative of both records.
-        weight = (frequency < ALIASED * rate) / (frequency**-2.0 * (1 + np.abs(gain) ** 2))
-        return Lags.of(rest(gain * x, y, weight, 2 * np.pi * frequency / rate))
 
 
 def _gain(

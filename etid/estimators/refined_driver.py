@@ -1,19 +1,13 @@
 """Refined Z_th: fits from several starts; the best result is kept and judged."""
 
 import dataclasses
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from etid.estimators.estimate import SOLVER
-from etid.estimators.judgement import MAX_STEPS_REACHED, misses, remarks
+from etid.estimators.judgement import MAX_STEPS_REACHED, misses
 from etid.estimators.lanes import Harmonics
-from etid.estimators.output_error import fit as output_error
-from etid.estimators.output_error import prediction
 from etid.estimators.starts import source_starts
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.likelihood import driver, of_calibrations
@@ -21,21 +15,18 @@ from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.linear import inverse
 from etid.likelihood.noise import shows_hum
 from etid.likelihood.source_prior import delay_std, delay_width
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, namespace
+from etid.precision import array_function, namespace, one_thread
 from etid.recordings.remarks import Remark
-from etid.results.driver import Calibration, ContinuousDriver, HarmonicDriver, SourceImpedance
+from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.results.fit import complex_rrse
 from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals import modal
 from etid.signals.knots import above_noise, banded
-from etid.signals.noise import Measurement
 from etid.signals.transfer import AnyArray, power
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
-ROUGHLY = 1e-5  # reduction of Σ r² in a step, below which a start of output error ends
 UNWANTED = 1e3  # added to the cost of a start that did not converge; larger than any cost
 # Two sections closer than `SPLIT` in ln ω and ln ζ are one section, split by noise. Their gains
 # grow with opposite signs along a curved valley, so the curvature at one point is not informative.
@@ -96,11 +87,12 @@ def from_harmonics(
     if r_load.size > 1:
         off = of_calibrations.mismatch(model, near, linear)
         calibration = dataclasses.replace(calibration, mismatch=off.off, across=off.across)
-    chi2 = 2 * least.objective / (model.terms - model.unknowns)
+    chi2 = 2 * least.objective / (model.terms - model.unknowns - model.unknown_states)
     gains = near.profiles[0].gains  # of all calibrations; hum shows in harmonics that are not used
-    squares = power(spectra.y - gains * spectra.x)
+    y = model.without_states(near.profiles)
+    squares = power(y - gains * spectra.x)
     squares = squares / (spectra.variance_y + power(gains) * spectra.variance_x)
-    rrse = complex_rrse(gains * spectra.x, spectra.y, spectra.selected).max()
+    rrse = complex_rrse(gains * spectra.x, y, spectra.selected).max()
     hum = shows_hum(squares, spectra.frequency[0], spectra.selected)
     passive = _is_passive(model.source, cov, rate)
     faults = _faults(chi2, rrse, least.settled, calibration, passive, model.terms, statistic)
@@ -122,71 +114,6 @@ def from_harmonics(
         spectra=spectra,
         instrument=instrument,
         missing_pole=statistic,
-    )
-
-
-def from_samples(
-    m: Measurement,
-    r_load: Float[Array, " record"],
-    order: int,
-    method: str,
-    instrument: Instrument | None,
-) -> ContinuousDriver:
-    """Refine Z_th by output error."""
-    rate = m.sample_rate[0]
-    baseline = iteration.driver_filter(m.v_th, m.v_out, r_load, order).filter
-    records = jax.vmap(prediction.prepare)(m)
-    starts = source_starts(baseline.den, order, rate, r_load.mean())
-    count = starts.log_resistance.size
-
-    def fitted(best: tuple[SourceImpedance, Array, Array], number: Array) -> tuple[Any, Any]:
-        last = number == count
-        start = jax.tree.map(
-            lambda every, one: jnp.where(last, one, every[number % count]), starts, best[0]
-        )
-        ftol = jnp.where(last, SOLVER.ftol, ROUGHLY)
-        source, estimate, calibration = output_error.fit_source(records, r_load, start, ftol)
-        passive = _is_passive(source, estimate.cov, rate)
-        # Starts that converged to a passive circuit come first. Among them log s + chi2 decides.
-        # With a noisy record, a spurious resonance can lower chi2 alone; but it raises s.
-        log_s = jnp.log(estimate.rrse**2 / estimate.chi2)
-        settled = estimate.result == optx.RESULTS.successful
-        cost = estimate.chi2 + log_s + jnp.where(settled, 0.0, UNWANTED)
-        estimate = dataclasses.replace(estimate, start=best[1])
-        new = source, number, _cost(source, cost, passive)
-        better = new[2] < best[2]
-        best = jax.tree.map(lambda one, other: jnp.where(better, one, other), new, best)
-        return best, (source, estimate, calibration, passive)
-
-    # All starts roughly, and then the best of them well: one loop holds the only copy of the fit.
-    nothing = jax.tree.map(lambda leaf: leaf[0], starts), jnp.array(0), jnp.array(jnp.inf)
-    _, found = jax.lax.scan(fitted, nothing, jnp.arange(count + 1))
-    source, estimate, calibration, passive = jax.tree.map(lambda leaf: leaf[-1], found)
-    terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
-    return ContinuousDriver(
-        b=baseline.num,
-        a=baseline.den,
-        sample_rate=rate,
-        cov=estimate.cov,
-        rrse=estimate.rrse,
-        chi2=estimate.chi2,
-        steps=estimate.steps,
-        start=estimate.start,
-        remarks=remarks(estimate),
-        source=source,
-        calibration=calibration,
-        result=first_verdict(
-            *_faults(
-                estimate.chi2,
-                estimate.rrse,
-                estimate.result == optx.RESULTS.successful,
-                calibration,
-                passive,
-                terms,
-            )
-        ),
-        instrument=instrument,
-        method=method,
     )
 
 

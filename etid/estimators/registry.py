@@ -4,7 +4,7 @@ import dataclasses
 
 from etid.estimators.estimator import AbstractEstimator, Description
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
-from etid.estimators.output_error.estimator import OutputError
+from etid.estimators.output_error import OutputError
 from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
 from etid.results.method_options import options_of
 

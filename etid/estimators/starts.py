@@ -1,23 +1,19 @@
 """Starts of the fits: impedance levels, simpler estimates, generic resonances."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.precision import array_function, namespace
 from etid.results.driver import SourceImpedance
-from etid.signals.harmonics import signal_share
-from etid.signals.transfer import AnyArray, frequency_variable, poles, power
+from etid.signals.transfer import AnyArray, poles
 
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels of the starts of a circuit
 # Starts of Z_th: frequency, relative to the sample rate, and damping ratio of two sections.
 # `FAR` is that of all further sections.
 GENERIC = (((0.1, 0.3), (0.5, 1.5)), ((0.25, 0.3), (0.5, 1.5)), ((0.1, 0.3), (0.25, 0.3)))
 FAR = (0.5, 1.5)
-# Time constants of the starts with a measured current, relative to the typical ones.
-TIME_SCALES = tuple(np.geomspace(1e-3, 1e5, 17).tolist())
 
 
 def circuit_starts(
@@ -48,33 +44,6 @@ def circuit_starts(
 def _scales(skin: SkinRC) -> Float[Array, "2"]:
     """Resistance at low frequency [Ω] and time constant [s]."""
     return jnp.stack([skin.r_s + skin.r_p, skin.r_p * skin.c_p])
-
-
-def current_starts(
-    frequency: Float[Array, " frequency"],
-    records: tuple[Complex[Array, " frequency"], Complex[Array, " frequency"]],
-    variances: tuple[Float[Array, " frequency"], Float[Array, " frequency"]],
-    circuit: AbstractCircuit,
-) -> Float[Array, "start element"]:
-    """Starts of the elements' logarithms from a measured current, one for each time scale.
-
-    The records are Fourier coefficients X of the current and Y of the voltage, with E|noise|² of
-    both. They show |Z| = |Y/X|. So the impedance level of each start is known. The means are over
-    ln f, because the lines of a spectrum are denser at high frequencies.
-    """
-    x, y = records
-    shown = signal_share(x, variances[0]) * signal_share(y, variances[1])
-    weight = jnp.where((power(x) > 0) & (power(y) > 0), shown, 0.0) / frequency
-    size = 0.5 * jnp.log(jnp.where(weight > 0, power(y) / power(x), 1.0))
-    by_size, by_time = circuit.scaling()
-    s = frequency_variable(frequency)
-
-    def start(scale: Float[Array, ""]) -> Float[Array, " element"]:
-        logs = circuit.log_values() + jnp.log(scale) * by_time
-        off = size - 0.5 * jnp.log(power(circuit.with_log_values(logs).impedance()(s)))
-        return logs + jnp.sum(weight * off) / jnp.sum(weight) * by_size
-
-    return jax.vmap(start)(jnp.asarray(TIME_SCALES))
 
 
 @array_function

@@ -38,22 +38,3 @@ class LoadUnknowns(eqx.Module):
     def vector(self) -> Float[Array, "*lane own"]:
         """The vector for a solver."""
         return jnp.concatenate([self.log_elements, jnp.stack(self.delays(), axis=-1)], axis=-1)
-
-
-class Nuisance(eqx.Module):
-    """Unknowns of a recording in time, without those of its load; several can be stacked.
-
-    Attributes:
-        state: State of the loaded driver at the first sample.
-        offset: Offset of V_out [V].
-        delay_samples: Trigger delay of the recording [samples].
-    """
-
-    state: Float[Array, "*lane state"]
-    offset: Float[Array, "*lane"]
-    delay_samples: Float[Array, "*lane"]
-
-    @classmethod
-    def of(cls, vector: Float[Array, "*lane nuisance"]) -> "Nuisance":
-        """The unknowns from the vector of a solver."""
-        return cls(vector[..., :-2], vector[..., -2], vector[..., -1])

@@ -3,16 +3,16 @@
 import dataclasses
 import logging
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, cast
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from etid.circuits.display import rounded
 from etid.estimators.estimator import AbstractEstimator, serving
-from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
-from etid.estimators.registry import Method
+from etid.estimators.lanes import AlignedSamples, Bins, Harmonics, stacked
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method, named
 from etid.identify import changes
 from etid.identify.arguments import check_alike, check_distinct, recordings
 from etid.identify.fitting import better_of, checksum, may_hum
@@ -20,11 +20,10 @@ from etid.identify.options import (
     Options,
     check_instrument,
     check_order,
-    for_calibrations,
     instrument_of,
+    unfit,
 )
 from etid.identify.planning import explained
-from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.causes import LOG, log_changes
 from etid.recordings.preflight import Inspected, preflight
@@ -44,7 +43,7 @@ from etid.signals.knots import above_noise, banded
 # to a few per cent.
 ROUGHLY = 3.0
 
-Lane = TypeVar("Lane", Harmonics, AlignedSamples)
+Lane = Harmonics | AlignedSamples
 
 
 @in_float64
@@ -64,11 +63,9 @@ def identify_driver(
         order: Number of poles of Z_th (the paper uses 5), or `"auto"`: from 7 on as many as the
             calibrations need, by maximum likelihood, so that the standard errors contain poles that
             the calibrations do not show. `driver.tried` holds the evidence.
-        method: `"maximum_likelihood"` (for records of several whole pulse periods),
-            `"output_error"`, the paper's `"steiglitz_mcbride"`, or its first iteration,
-            `"equation_error"`. An estimator with options is possible too, as in
-            `etid.SteiglitzMcBride(iterations=5)`. If not given, maximum likelihood is used if the
-            records allow it, else output error.
+        method: `"maximum_likelihood"`, the default; `"output_error"`, the paper's
+            `"steiglitz_mcbride"`, or its first iteration, `"equation_error"`. An estimator with
+            options is possible too, as in `etid.SteiglitzMcBride(iterations=5)`.
         plausible: Smallest and largest |Z_th| [Ω] at 1 kHz that is accepted. The default range
             spans a factor of 1000: a driver within the range leaves it if `r_load` is given in kΩ.
         instrument: Tolerances of the instrument, as in `etid.Instrument(gain=1e-3)`. They enter the
@@ -97,7 +94,6 @@ def identify_driver(
 
 def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> Driver:
     """`identify_driver` with arguments that are checked."""
-    asked = options.estimator
     if not records:
         raise ValueError(
             "no calibration given; a driver needs at least one record with a known r_load"
@@ -114,7 +110,7 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
     check_distinct("calibrations", records)
     seen = [Inspected.of(record) for record in records]
     for one in seen:
-        _refused(one, preflight(one, periodic=asked is not None and asked.lane.periodic))
+        _refused(one, preflight(one))
     rough = [_rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
     if max(rough) > ROUGHLY * min(rough):
         shown = ", ".join(
@@ -123,9 +119,9 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
         )
         text = f"calibrations show impedances of about {shown}: resistors_disagree. "
         raise IdentificationError(text + message("resistors_disagree"), None)
-    estimator = for_calibrations(asked, seen)
+    estimator = options.estimator or MAXIMUM_LIKELIHOOD
     for one in seen:
-        _refused(one, "biased" if estimator.lane.periodic and one.is_aliased else None)
+        _refused(one, unfit(estimator, one))
     check_order(options.order, estimator)
     instrument = options.instrument
     # What a file states enters no standard errors where there are none.
@@ -229,7 +225,7 @@ def _aligned(
 ) -> Driver:
     """The driver from calibrations that passed the pre-flight, aligned by their lags."""
     r_load = np.array([one.recording.r_load for one in seen], float)
-    records = _lanes(seen, Harmonics) if estimator.lane.periodic else _lanes(seen, AlignedSamples)
+    records = _lanes(seen, estimator)
     driver = _identified(records, r_load, order, estimator, instrument)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
     # elsewhere.
@@ -240,9 +236,14 @@ def _aligned(
     return driver
 
 
-def _lanes(seen: Sequence[Inspected], kind: type[Lane]) -> Lane:
+def _lanes(seen: Sequence[Inspected], estimator: AbstractEstimator) -> Lane:
     """The data of the calibrations, stacked."""
-    lanes = [kind.of(one) for one in seen]
+    kinds = {estimator.lane_of(one) for one in seen}
+    kind = kinds.pop() if len(kinds) == 1 else Bins
+    if issubclass(kind, Bins):  # the bins of all of them have the same frequencies
+        shortest = min(one.aligned[0].size for one in seen)
+        return stacked([kind.of_first(one, shortest) for one in seen])
+    lanes: list[Any] = [kind.of(one) for one in seen]
     size = min(one.size for one in lanes)  # counted pulse rates may differ by one harmonic
     return stacked([jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes])
 
@@ -252,9 +253,9 @@ def with_harmonics(driver: ContinuousDriver, calibrations: Sequence[Recording]) 
     """A driver of a file of fits, with the harmonics of its calibrations, which no file holds."""
     seen = [Inspected.of(one) for one in calibrations]
     for one in seen:
-        _refused(one, preflight(one, periodic=True))
+        _refused(one, preflight(one))
     own = {of.name: getattr(driver, of.name) for of in dataclasses.fields(ContinuousDriver)}
-    records = _lanes(seen, Harmonics)
+    records = cast(Harmonics, _lanes(seen, named(str(driver.method))))
     if int(driver.remarks) & Remark.mains_hum:
         records = records.without_mains() or records
     spectra = _clear(records)
@@ -274,20 +275,5 @@ def _identified(
     estimator: AbstractEstimator,
     instrument: Instrument | None,
 ) -> Driver:
-    if estimator.rows:
-        records = lanes.measure() if isinstance(lanes, AlignedSamples) else lanes
-        return jax.device_put(estimator.fit_driver(records, r_load, order, instrument))
-    return _traced(lanes, r_load, order, estimator, instrument)
-
-
-@program
-def _traced(
-    lanes: AlignedSamples | Harmonics,
-    r_load: Float[Array | np.ndarray, " record"],
-    order: int,
-    estimator: AbstractEstimator,
-    instrument: Instrument | None,
-) -> Driver:
-    samples = isinstance(lanes, AlignedSamples)
-    records = jax.vmap(AlignedSamples.measure)(lanes) if samples else lanes
-    return estimator.fit_driver(records, r_load, order, instrument)
+    records = lanes.measure() if isinstance(lanes, AlignedSamples) else lanes
+    return jax.device_put(estimator.fit_driver(records, r_load, order, instrument))

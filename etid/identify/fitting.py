@@ -1,9 +1,7 @@
 """The fit of a batch of recordings that share a driver: fitted, fitted again, judged.
 
-NumPy fits rows of recordings (`estimator.rows`). For other estimators and on accelerators, the
-recordings of one length share one compiled function. It takes up to `LANES` recordings, so that
-memory is bounded. A processor fits them one after the other: side by side (`vmap`) they take twice
-the time, even with equal numbers of steps. Accelerators fit them side by side.
+NumPy fits rows of recordings. On accelerators, the recordings of one length share one compiled
+function, which fits them side by side.
 
 A recording is fitted again if it is late, after a shift of its records, and if hum may explain what
 its fit misses, without the mains harmonics.
@@ -16,10 +14,10 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
@@ -38,9 +36,7 @@ from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.identify import changes
 from etid.identify.second_minimum import ASIDE, likelier
-from etid.numpy_tier.algebra import one_thread
-from etid.numpy_tier.tiers import program, worth_compiling
-from etid.precision import untraced
+from etid.precision import one_thread, untraced
 from etid.recordings.causes import LOG, log_changes
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
@@ -62,54 +58,15 @@ ROWS = True  # whether NumPy fits harmonics as rows; if not, JAX does
 _Outcome = TypeVar("_Outcome", Fit, Driver)
 
 
-def skin_lane(
-    lane: Any,
+@eqx.filter_jit
+def _side_by_side(
+    lanes: AbstractLane,
     driver: AbstractFeed,
     known: Any,
     circuit: AbstractCircuit,
     estimator: AbstractEstimator,
 ) -> Fit:
-    """The fit of one lane. The code is differentiable; the caller compiles and batches it."""
-    return estimator.fit_load(lane, driver, known, circuit)
-
-
-skin = program(skin_lane)
-
-
-@functools.partial(program, batch=True)
-def _chunk(
-    lanes: Any,
-    count: Int[Array, ""],
-    driver: AbstractFeed,
-    known: Any,
-    circuit: AbstractCircuit,
-    estimator: AbstractEstimator,
-) -> Fit:
-    return each(lambda lane: skin_lane(lane, driver, known, circuit, estimator), lanes, count)
-
-
-def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> Any:
-    """Results of `fit` for the first `count` lanes; zeros for the others on a CPU."""
-    if jax.default_backend() != "cpu":
-        return jax.vmap(fit)(lanes)
-    once = jax.jit(fit)  # so that the shapes and the calls need one trace only
-    first = jax.tree.map(lambda leaf: leaf[0], lanes)
-    shapes = jax.eval_shape(once, first)
-
-    def nothing(_) -> Any:
-        return jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes)
-
-    def one(numbered: tuple[Int[Array, ""], Any]) -> Any:
-        number, lane = numbered
-        return jax.lax.cond(number < count, once, nothing, lane)
-
-    size = jax.tree.leaves(lanes)[0].shape[0]
-    return jax.lax.map(one, (jnp.arange(size), lanes))
-
-
-def filled(lanes: Sequence[AbstractLane]) -> AbstractLane:
-    """`LANES` lanes, padded with copies of the last lane."""
-    return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
+    return jax.vmap(lambda lane: estimator.fit_load(lane, driver, known, circuit))(lanes)
 
 
 @one_thread()
@@ -193,7 +150,14 @@ class Prepared(NamedTuple):
     def key(self) -> tuple[Any, ...]:
         """Equal for recordings that one call can fit."""
         rates = self.seen.recording.sample_rate, self.seen.recording.pulse_rate
-        return id(self.driver), self.estimator, self.lane.shapes, self.shared, rates
+        return (
+            id(self.driver),
+            self.estimator,
+            type(self.lane),
+            self.lane.shapes,
+            self.shared,
+            rates,
+        )
 
 
 @dataclasses.dataclass
@@ -283,7 +247,7 @@ def refitted(
         late = late_by(lanes, found)
         for row, by in late.items():
             seen[row].realign(*by)
-            lanes[row] = lanes[row].realigned(by)
+            lanes[row] = type(lanes[row]).of(seen[row])
         return {row: lanes[row] for row in late}
 
     def without_mains(found: _Several) -> dict[int, AbstractLane]:
@@ -452,17 +416,12 @@ def fits_of(
     known: Any,
     circuit: AbstractCircuit,
     estimator: AbstractEstimator,
-    total: int = 1,
 ) -> Fit:
-    """Fits of lanes of one shape, stacked; `total` is their number here and in other calls."""
-    of = driver, known, circuit, estimator
-    if ROWS and jax.default_backend() == "cpu" and estimator.rows:
-        parts = estimator.fit_rows(lanes, *of[:-1])
+    """Fits of lanes of one shape, stacked."""
+    if ROWS and jax.default_backend() == "cpu":
+        parts = estimator.fit_rows(lanes, driver, known, circuit)
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    if not worth_compiling(total):
-        return stacked(jax.device_get([skin(lane, *of) for lane in lanes]))
-    fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
-    return taken(fits, np.arange(len(lanes)))  # without the padding
+    return jax.device_get(_side_by_side(stacked(lanes), driver, known, circuit, estimator))
 
 
 class Batch:
@@ -494,22 +453,27 @@ class Batch:
         """Whether a call has its lanes, or the recordings take much memory."""
         return len(self.rows) == LANES or (len(self.rows) >= FEWEST and self._samples >= HELD)
 
-    def fitted(self, candidates: Sequence[AbstractCircuit], total: int) -> CandidateFits:
-        """The fits, with their verdicts.
+    def fitted(self, candidates: Sequence[AbstractCircuit]) -> CandidateFits:
+        """The fits of the best of these circuits, with their verdicts."""
+        _, driver, estimator, _, shared = self.like
 
-        Args:
-            candidates: Circuits to choose from.
-            total: Number of recordings that are fitted in this way, here and in other calls.
-        """
-        _, driver, estimator, first, shared = self.like
-        known = known_of(first, driver, shared, estimator)
-
-        def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
-            found = fits_of(lanes, driver, known, circuit, estimator, total)
+        def alike(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
+            known = known_of(lanes[0], driver, shared, estimator)
+            found = fits_of(lanes, driver, known, circuit, estimator)
             if not isinstance(known, GivenDriver) or not has_open_resonance(driver):
                 return found
             aside = dataclasses.replace(known, aside=np.asarray(ASIDE))
-            return likelier(found, fits_of(lanes, driver, aside, circuit, estimator, total))
+            return likelier(found, fits_of(lanes, driver, aside, circuit, estimator))
+
+        def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
+            rows: dict[Any, list[int]] = {}  # those that are realigned may have other shapes
+            for row, lane in enumerate(lanes):
+                rows.setdefault(lane.shapes, []).append(row)
+            if len(rows) == 1:
+                return alike(lanes, circuit)
+            parts = [alike([lanes[row] for row in each], circuit) for each in rows.values()]
+            whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+            return taken(whole, np.argsort(np.concatenate(list(rows.values()))))
 
         found = refitted_loads(self.lanes, self.seen, fit, driver, candidates)
         return judged(found, driver, self.seen, estimator)

@@ -37,8 +37,7 @@ from etid.identify.kramers_kronig import (
     kramers_kronig,
 )
 from etid.likelihood.linear import LevenbergMarquardt, NormalEquations
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, in_float64
+from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.remarks import Remark, texts
 from etid.results.data import MeasuredImpedance, with_data
 from etid.results.driver import AUTO

@@ -55,8 +55,7 @@ from etid.likelihood.fit import Estimate
 from etid.likelihood.joint.fit import Delays, Found, start_of
 from etid.likelihood.joint.fit import fit as fit_together
 from etid.likelihood.joint.loads import Loads
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, in_float64, untraced
+from etid.precision import array_function, in_float64, one_thread, untraced
 from etid.recordings.errors import RecordingError
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
@@ -317,9 +316,9 @@ def identify_jointly(
             row, refusal = batch
             refused[row] = NOT_PERIODIC if refusal.name == NOT_PERIODIC.name else refusal
         elif isinstance(batch.like.driver, MeasuredCurrent):
-            found = batch.fitted(only.circuits, len(paths)).only
+            found = batch.fitted(only.circuits).only
             keep(batch.rows, dataclasses.replace(found, method=METHOD), batch.like.driver)
-        elif batch.like.estimator.lane.periodic:
+        elif batch.like.lane.periodic:
             for row, seen in zip(batch.rows, batch.seen, strict=True):
                 check_new(f"study[{paths[row]!r}]", seen.recording, first)
             lengths = groups.setdefault(drivers.of(batch.seen[0].recording), {})

@@ -15,9 +15,9 @@ from etid.circuits.current_dependent import current_dependent
 from etid.estimators.element_limits import Limits, checked_limits
 from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
-from etid.estimators.output_error.estimator import OutputError
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT, Method, named
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, WITH_CURRENT, Method, named
 from etid.identify.arguments import (
     Interval,
     bounds_of,
@@ -32,7 +32,7 @@ from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import AUTO, ContinuousDriver, HarmonicDriver, Order
-from etid.results.feed import AbstractFeed, MeasuredCurrent
+from etid.results.feed import AbstractFeed
 from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, Settings, sha256, versions
 from etid.selection.search import usual_circuits
@@ -129,7 +129,7 @@ class Options:
         """
         if not self.known and not self.bounds:
             return estimator
-        if not isinstance(estimator, MaximumLikelihood | OutputError):
+        if not isinstance(estimator, MaximumLikelihood):
             raise ValueError(
                 f"method {str(estimator)!r} takes no known elements and no bounds; use "
                 "the method maximum_likelihood or output_error"
@@ -233,19 +233,11 @@ def check_instrument(instrument: Instrument | None, estimator: AbstractEstimator
     """Raise ValueError if an estimator has no parameters for the tolerances of an instrument."""
     if instrument is None or isinstance(estimator, MaximumLikelihood) or not instrument.stored():
         return
-    if not issubclass(estimator.driver, ContinuousDriver):
-        raise ValueError(
-            "the tolerances of an instrument enter standard errors, and method "
-            f"{str(estimator)!r} gives none; use the method maximum_likelihood, or state nothing: "
-            "instrument=etid.Instrument() or --tolerance drift=0"
-        )
-    if instrument.stored().keys() - {"drift"}:
-        raise ValueError(
-            "the tolerances of an instrument are parameters of maximum likelihood, and the method "
-            f"is {str(estimator)!r}, which has the drift of a driver only; record three pulse "
-            "periods or more, or state nothing else: instrument=etid.Instrument() or "
-            "--tolerance drift=0"
-        )
+    raise ValueError(
+        "the tolerances of an instrument enter standard errors, and method "
+        f"{str(estimator)!r} gives none; use the method maximum_likelihood, or state nothing: "
+        "instrument=etid.Instrument() or --tolerance drift=0"
+    )
 
 
 def instrument_of(calibrations: Sequence[Recording | Metadata]) -> Instrument | None:
@@ -285,41 +277,19 @@ def check_order(order: Order, estimator: AbstractEstimator) -> None:
     if order == AUTO and not issubclass(estimator.driver, HarmonicDriver):
         raise ValueError(
             f"order 'auto' needs maximum likelihood, but the method is {str(estimator)!r}; give a "
-            "number of poles, such as 5, or record several whole pulse periods"
+            "number of poles, such as 5"
         )
 
 
-def for_calibrations(
-    asked: AbstractEstimator | None, recordings: Sequence[Inspected]
-) -> AbstractEstimator:
-    """The requested estimator, or the default estimator of calibrations.
-
-    The default is maximum likelihood if all records hold several periods, or one without aliases.
-    Otherwise it is output error: in a single period the aliases are not in the standard errors of
-    maximum likelihood. Output error weighs all frequencies alike; of a single period of a 1/f
-    multisine, it does not find the elements.
-    """
-    if asked is not None:
-        return asked
-    on_harmonics = all(
-        seen.periods[0] > 0 and seen.is_periodic and (seen.periods[0] > 1 or seen.has_no_aliases)
-        for seen in recordings
+def unfit(estimator: AbstractEstimator, seen: Inspected) -> str | None:
+    """Why the data that an estimator takes of a recording cannot be fitted; None if they can."""
+    kind = estimator.lane_of(seen)
+    if kind.periodic and not seen.is_periodic:
+        return "not_periodic"
+    aliased = issubclass(kind, Harmonics) and (
+        seen.is_aliased if kind.periodic else seen.bins.is_aliased
     )
-    return MAXIMUM_LIKELIHOOD if on_harmonics else OUTPUT_ERROR
-
-
-def check_default(estimator: AbstractEstimator, circuits: Sequence[AbstractCircuit]) -> None:
-    """Raise ValueError if the default estimator cannot identify these circuits."""
-    try:
-        check_circuits(estimator, circuits)
-    except ValueError as error:
-        raise ValueError(
-            "the record holds less than two whole pulse periods or begins in a pulse, or its "
-            f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
-            "three periods or more and identify the driver with the method maximum_likelihood, or "
-            "ask for the method maximum_likelihood, whose standard errors do not include the "
-            "effect of aliases in a single period"
-        ) from error
+    return "biased" if aliased else None
 
 
 def plan(
@@ -330,17 +300,15 @@ def plan(
     Raises:
         ValueError: The estimator cannot use this driver.
     """
-    of_caller = options.estimator
-    name = preflight(seen, periodic=of_caller is not None and of_caller.lane.periodic)
-    estimator = of_caller or OUTPUT_ERROR
-    if name is None and isinstance(driver, HarmonicDriver | MeasuredCurrent):
-        estimator = for_calibrations(of_caller, [seen])
-        if of_caller is None and estimator is MAXIMUM_LIKELIHOOD and seen.by_current is not None:
-            name = preflight(seen.by_current, periodic=True)
-            if name == "flat":  # v_out is not; without a signal a current contradicts nothing
-                name = None
-            elif name is not None or seen.has_all:
-                estimator = WITH_CURRENT
+    of_caller, name = options.estimator, preflight(seen)
+    estimator = of_caller or MAXIMUM_LIKELIHOOD
+    current = seen.by_current if isinstance(driver, ContinuousDriver) else None
+    if name is None and of_caller is None and current is not None and seen.is_whole:
+        name = preflight(current, periodic=True)
+        if name == "flat":  # v_out is not; without a signal a current contradicts nothing
+            name = None
+        elif name is not None or seen.has_all:
+            estimator = WITH_CURRENT
     if name is None and isinstance(estimator, MaximumLikelihood) and estimator.with_current:
         if not seen.has_all:
             raise ValueError(
@@ -349,8 +317,7 @@ def plan(
             )
         if seen.by_current is not None and seen.by_current.is_aliased:
             name = "biased"
-    if name is None and estimator.lane.periodic and seen.is_aliased:
-        name = "biased"
+    name = name or unfit(estimator, seen)
     estimator.check_driver(driver, seen.recording.sample_rate)
     if isinstance(driver, ContinuousDriver) and issubclass(estimator.driver, ContinuousDriver):
         check_instrument(driver.instrument, estimator)

@@ -22,7 +22,7 @@ from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane
 from etid.identify import changes
 from etid.identify.fitting import FEWEST, Batch, Prepared, is_shared
-from etid.identify.options import Options, check_default, plan
+from etid.identify.options import Options, plan
 from etid.precision import in_float64
 from etid.recordings.causes import why_implausible, why_misaligned, why_rates_differ
 from etid.recordings.preflight import Inspected, inspected, preflight
@@ -93,7 +93,7 @@ def prepared(
         if isinstance(chosen, Refusal):
             found.append((row, chosen))
         else:
-            planned.setdefault(chosen.lane, []).append((row, (seen, driver, chosen)))
+            planned.setdefault(chosen.lane_of(seen), []).append((row, (seen, driver, chosen)))
     for kind, alike in planned.items():
         lanes = kind.of_several([seen for _, (seen, *_) in alike])
         for (row, (seen, driver, estimator)), lane in zip(alike, lanes, strict=True):
@@ -112,10 +112,6 @@ def _planned(
         return Refusal.of(error)
     if name is not None:
         return Refusal(name, explained(seen, name))
-    try:
-        check_default(estimator, options.circuits)
-    except ValueError as error:
-        return Refusal("not_periodic", str(error))
     return estimator
 
 

@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_limits import Limits, of_circuit
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, taken
+from etid.estimators.lanes import Harmonics, taken
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
@@ -37,8 +37,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.fitting import fits_of, is_shared, known_of
 from etid.likelihood.search import ROWS, Load, minimum
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, in_float64
+from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -272,10 +271,10 @@ def given(
     cov = _determined(fit)
     seen = Inspected.of(recording)
     estimator = cast(MaximumLikelihood, named(fit.method))
-    lane = (HarmonicsWithCurrent if estimator.with_current else Harmonics).of(seen)
-    late = lane.late_by(fit.circuit, feed)  # as `etid.identify.fitting.refitted` does it
+    kind = cast(type[Harmonics], estimator.lane_of(seen))
+    late = kind.of(seen).late_by(fit.circuit, feed)  # as `etid.identify.fitting.refitted` does it
     seen.realign(*late)
-    lane = lane.realigned(late)
+    lane = kind.of(seen)
     if int(fit.remarks) & Remark.mains_hum:
         lane = lane.without_mains() or lane
     known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)

@@ -19,10 +19,9 @@ from jaxtyping import Complex, Float
 from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.circuits.impedance import realise
 from etid.estimators.estimator import serving
-from etid.estimators.registry import OUTPUT_ERROR
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import fed, given_circuit
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, held, in_float64, namespace, untraced
+from etid.precision import array_function, held, in_float64, namespace, one_thread, untraced
 from etid.recordings.inspection import Inspection
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
@@ -70,13 +69,18 @@ def predict(
     else:
         raise ValueError("give the circuit: this recording has no known resistor")
     if not isinstance(feed, MeasuredCurrent):
-        feed = untraced(serving(feed, ContinuousDriver, str(OUTPUT_ERROR)))
+        feed = untraced(serving(feed, ContinuousDriver, MAXIMUM_LIKELIHOOD.name))
     # Disturbed periods are predicted too.
     seen, simulated = Inspected(Inspection([recording])), load.impedance().has_response
     if not load.is_rational and (seen.whole_periods[0] > 0 or not simulated):
         if isinstance(feed, ContinuousDriver):
             return _predict_periods(Inspected.of(recording), feed, load)
-        OUTPUT_ERROR.check_circuit(load)
+        if not simulated:
+            raise ValueError(
+                f"the response in time of {type(load).__name__} is not known, so no voltage is "
+                "predicted from a measured current; use a ratio of polynomials in s or constant "
+                "phases"
+            )
     inner = fitted_voltage(*seen.aligned, recording.sample_rate, feed, untraced(load))
     first = TAPS - 1 + max(seen.lag, 0)
     edges = first, recording.v_out.size - first - inner.size

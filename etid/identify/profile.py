@@ -14,8 +14,7 @@ from etid.estimators.element_prior import FIXED, require_element
 from etid.identify.posterior import Known, Minimum, costs, given
 from etid.likelihood.linear import LevenbergMarquardt, NormalEquations
 from etid.likelihood.search import Anew
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, in_float64
+from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.fit import Fit

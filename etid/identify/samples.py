@@ -1,6 +1,7 @@
 """Identification of plain arrays, which JAX can transform."""
 
 import dataclasses
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,9 @@ from jaxtyping import Array, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import Harmonics
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import require
-from etid.identify.fitting import skin_lane
-from etid.identify.options import Options, candidates_of, check_default
+from etid.identify.options import Options, candidates_of
 from etid.precision import in_float64, namespace, untraced
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
@@ -52,9 +52,8 @@ def identify_samples(
         pulse_rate: Pulses per second [Hz].
         resolution: Step of the converter [V] at the terminal; 0 if not known.
         circuit: As in `identify_skin`.
-        method: As in `identify_driver`. If not given, maximum likelihood for several whole
-            periods, else output error. The function does not check that the periods begin between
-            pulses.
+        method: As in `identify_driver`. The records are harmonics if they hold several whole
+            periods. The function does not check that these begin between pulses.
 
     Returns:
         Elements, standard errors and verdict; arrays of NumPy unless JAX traces the call.
@@ -65,32 +64,25 @@ def identify_samples(
     require("driver", driver, Driver)
     options = Options.of(candidates_of(circuit), method=method)
     periods = whole_periods(v_out.shape[0], sample_rate, pulse_rate)
-    estimator = options.estimator
-    if estimator is None:
-        estimator = _default(driver, periods[0])
-        check_default(estimator, options.circuits)
+    estimator = cast(AbstractEstimator, options.estimator or MAXIMUM_LIKELIHOOD)
     estimator.check_driver(driver, sample_rate)
     recorded = unmasked(v_th)
     v_th, v_out, step = (jnp.asarray(unmasked(value), float) for value in (v_th, v_out, resolution))
     rate = untraced(unmasked(sample_rate))
     # At harmonics the noise is measured, and its floor is needed only. White noise is a median: by
     # its derivative, few samples would have most of the weight.
-    of = floor if estimator.lane.periodic else noise
+    kind = estimator.lane_of_periods(periods[0])
+    of = floor if issubclass(kind, Harmonics) else noise
     of_th, of_out = (jax.lax.stop_gradient(jnp.asarray(of(v, step))) for v in (v_th, v_out))
-    lane = estimator.lane.of_samples(Measurement(v_th, v_out, of_th, of_out, rate), periods)
+    lane = kind.of_samples(Measurement(v_th, v_out, of_th, of_out, rate), periods)
     known = None
     if isinstance(lane, Harmonics):
-        shared = _may_share(recorded, driver, periods)
+        shared = kind.periodic and _may_share(recorded, driver, periods)
         known = estimator.known(*untraced((driver, lane.frequency)), shared)
-    fit = skin_lane(lane, driver, known, options.circuit, estimator)
+    fit = estimator.fit_load(lane, driver, known, options.circuit)
     # No harmonic is left out here, so a remark about hum would be untrue.
     remarks = fit.remarks & ~int(Remark.mains_hum)
     return dataclasses.replace(fit, remarks=namespace(remarks).asarray(remarks))
-
-
-def _default(driver: Driver, periods: int) -> AbstractEstimator:
-    several = isinstance(driver, HarmonicDriver) and periods > 1
-    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
 
 
 def _may_share(recorded: AnyArray, driver: Driver, periods: tuple[int, int]) -> bool:

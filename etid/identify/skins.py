@@ -20,7 +20,6 @@ from etid.identify.options import (
     Interval,
     Options,
     candidates_of,
-    check_default,
     plan,
 )
 from etid.identify.planning import EXPLAINED, explained, failed_fit
@@ -138,11 +137,11 @@ def candidate_fits(
     estimator, name = plan(options, seen, feed)
     if name is not None:
         return {0: failed_fit(name, options, str(estimator))}, 0
-    check_default(estimator, options.circuits)
-    one = Prepared(seen, feed, estimator, estimator.lane.of(seen), is_shared(seen, feed))
+    lane = estimator.lane_of(seen).of(seen)
+    one = Prepared(seen, feed, estimator, lane, is_shared(seen, feed))
     batch = Batch(one)
     batch.add(0, one)
-    found = batch.fitted(options.circuits, 1)
+    found = batch.fitted(options.circuits)
     return found[0], found.chosen(0)
 
 

@@ -210,7 +210,7 @@ def _parts(count: int, load: Load, options: Options, progress: bool, total: int)
     otherwise = str(options.estimator or MAXIMUM_LIKELIHOOD)
     for batch in batches(count, load, options, progress):
         if isinstance(batch, Batch):
-            yield _Part(batch.rows, batch.fitted(options.circuits, total), batch.like.driver)
+            yield _Part(batch.rows, batch.fitted(options.circuits), batch.like.driver)
         else:
             row, refusal = batch
             fit = failed_fit(refusal.name, options, otherwise)

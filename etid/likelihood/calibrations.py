@@ -15,11 +15,18 @@ from jaxtyping import Complex, Float
 
 from etid.likelihood.gains import FAULTS, Slopes
 from etid.likelihood.noise import excess
-from etid.likelihood.profile import Condensed, Profile, Records, added
+from etid.likelihood.profile import (
+    Condensed,
+    Profile,
+    Records,
+    States,
+    added,
+)
 from etid.likelihood.sandwich import Linear
 from etid.likelihood.shared import Calibrated
 from etid.likelihood.source import Source, Tolerances
 from etid.likelihood.source_prior import DELAY_WIDTH, SourcePrior, delay_width
+from etid.likelihood.transient import ENDS, ends, states_of_calibrations, width_of
 from etid.precision import array_function, namespace
 from etid.results.driver import Calibration, HarmonicDriver
 from etid.results.feed import SourceImpedance
@@ -49,12 +56,15 @@ class Near(NamedTuple):
         profiles: The likelihood of each unloaded record and its outputs at all harmonics.
         condensed: The same of all of them at the knots.
         slopes: The gains and their derivatives at the knots; their z is Z_th.
+        states_by_q: Derivatives of what the states make of the outputs at the knots, but for those
+            by the gains; None for whole periods.
     """
 
     q: Float[AnyArray, "*row q"]
     profiles: list[Profile]
     condensed: Condensed
     slopes: Slopes
+    states_by_q: Complex[AnyArray, "*row q record knot"] | None = None
 
     @property
     def objective(self) -> Float[AnyArray, "*row"]:
@@ -64,7 +74,20 @@ class Near(NamedTuple):
     @property
     def jacobian(self) -> Float[AnyArray, "*row q part"]:
         """Transposed Jacobian of the condensed terms."""
-        return self.condensed.rows(self.slopes.by_q)
+        return self.rows(self.slopes)
+
+    def rows(self, slopes: Slopes) -> Float[AnyArray, "*row q part"]:
+        """Derivatives of the condensed terms at other gains."""
+        return self.condensed.rows(slopes.by_q, self.states_by_q)
+
+    def terms(
+        self, q: Float[AnyArray, "*row q"], gains: Complex[AnyArray, "*row record knot"]
+    ) -> Float[AnyArray, "*row part"]:
+        """The condensed terms at q."""
+        if self.states_by_q is None:
+            return self.condensed.terms(gains)
+        moved = (as_complex(q - self.q)[..., None, None] * self.states_by_q).sum(-3)
+        return self.condensed.terms(gains, moved)
 
 
 @jax.tree_util.register_dataclass
@@ -180,9 +203,49 @@ class Calibrations:
         return found
 
     @array_function
-    def profiles(self, gains: Complex[AnyArray, "*row record bin"]) -> list[Profile]:
-        """The likelihood of each unloaded record and its outputs."""
-        return [Profile.of(of, gains) for of in self.records()]
+    def profiles(
+        self,
+        common: Float[AnyArray, "*row common"],
+        gains: Complex[AnyArray, "*row record bin"] | None = None,
+    ) -> list[Profile]:
+        """The likelihood of each unloaded record and its outputs; other gains may be given."""
+        gains = self.gains(common) if gains is None else gains
+        states = self.states(common, gains)
+        return [Profile.of(of, gains, states) for of in self.records()]
+
+    def states(
+        self, common: Float[AnyArray, "*row common"], gains: Complex[AnyArray, "*row record bin"]
+    ) -> States | None:
+        """What the states at the ends of the records make; None for whole periods."""
+        s = self.spectra
+        if s.whole:
+            return None
+        rate, first = self.rate, s.frequency[0, 0]
+        of_ends = ends(s.x.shape[-1]) * (first / rate)
+        decays = modal.decays(self.parameters(common), self._sections, s.frequency[0])
+        width = width_of(s.y, s.selected)
+        return states_of_calibrations(gains, decays * first, of_ends, width)
+
+    @property
+    def unknown_states(self) -> int:
+        """Number of states of the records."""
+        count, poles = self.calibration.r_load.shape[0], self.source.order
+        return 0 if self.spectra.whole else count * (poles + ENDS)
+
+    def _states_by_q(
+        self, common: Float[AnyArray, "*row common"], profiles: list[Profile], slopes: Slopes
+    ) -> Complex[AnyArray, "*row common record knot"]:
+        """∂/∂c of what the states make, at the same X − V."""
+        xp, count = namespace(common), self.calibration.r_load.shape[0]
+        p = added([of.states for of in profiles])[..., : count * self.source.order]
+        p = p.reshape(*p.shape[:-1], count, -1)
+        f, first = self._frequency(self.knots)[0], self.spectra.frequency[0, 0]
+        moved = modal.decays_by_parameters(self.parameters(common), self._sections, p * first, f)
+        by_source = -xp.moveaxis(moved, -2, -3) * slopes.gains[..., None, :, :]
+        rest = xp.zeros(
+            (*by_source.shape[:-3], common.shape[-1] - self._of_source, *by_source.shape[-2:])
+        )
+        return xp.concatenate([by_source, as_complex(rest)], -3)
 
     @array_function
     def squares(self, profiles: list[Profile]) -> Float[AnyArray, "*row record bin"]:
@@ -287,6 +350,7 @@ class Calibrations:
             cov=xp.diag(zero),
             delay_width=xp.asarray(self.delay_width),
             tolerances=tolerances,
+            decays=modal.decays(source.vector(), self._sections, frequency),
         )
 
     @array_function
@@ -297,13 +361,24 @@ class Calibrations:
         found, s = self.slopes(common), self.spectra
         by_z = combined(directions.T, found.by_q.reshape(common.shape[0], -1))
         by_z = by_z.reshape(-1, *found.gains.shape)
-        return Calibrated(s.x, s.y, s.variance_y, s.selected, found.gains, by_z)
+        y = self.without_states(self.profiles(common, found.gains))
+        return Calibrated(s.x, y, s.variance_y, s.selected, found.gains, by_z)
+
+    def without_states(self, profiles: list[Profile]) -> Complex[AnyArray, "*row record bin"]:
+        """The outputs without what the states make of them."""
+        made = [of.made for of in profiles if of.made is not None]
+        return self.spectra.y - added(made) if made else self.spectra.y
 
     @array_function
     def near(self, common: Float[AnyArray, "*row common"]) -> Near:
         """The calibrations near these common parameters."""
-        every, profiles = self.knots, self.profiles(self.gains(common))
-        return Near(common, profiles, Condensed.of(profiles, every), self.slopes(common, every))
+        every, gains = self.knots, self.gains(common)
+        profiles, slopes = self.profiles(common, gains), self.slopes(common, every)
+        states, by_q = self.states(common, gains), None
+        if states is not None:
+            by_q = self._states_by_q(common, profiles, slopes)
+        condensed = Condensed.of(profiles, every, states)
+        return Near(common, profiles, condensed, slopes, by_q)
 
     @array_function
     def linear(self, near: Near) -> Linear:
@@ -362,7 +437,7 @@ class Calibrations:
         """
         start, at = self.start(), []
         for c in (common, start):
-            profiles = self.profiles(self.gains(c))
+            profiles = self.profiles(c)
             at.append((2 * self.squares(profiles), self.weak(c)[0] ** 2, self.noise(profiles)))
         (squares, weak, _), (before, weak_before, noise) = at
         return ((squares - before) / noise).sum() + (weak - weak_before).sum()

@@ -79,14 +79,14 @@ class AtKnots:
     ) -> Float[AnyArray, "*row q"]:
         """Jᵀ r″ of a step from a point."""
         q = q + DIFFERENCE * move
-        ahead = self.near.condensed.terms(self.model.gains(q, self.model.knots))
+        ahead = self.near.terms(q, self.model.gains(q, self.model.knots))
         return bend(at, namespace(q).concatenate([ahead, self.model.weak(q)[0]], -1), move)
 
     def at(self, q: Float[AnyArray, "*row q"], slopes: Slopes) -> NormalEquations:
         """The normal equations where the slopes are known."""
-        xp, condensed, (weak, by_weak) = namespace(q), self.near.condensed, self.model.weak(q)
-        at = xp.concatenate([condensed.terms(slopes.gains), weak], -1)
-        rows = xp.concatenate([condensed.rows(slopes.by_q), by_weak], -1)
+        xp, near, (weak, by_weak) = namespace(q), self.near, self.model.weak(q)
+        at = xp.concatenate([near.terms(q, slopes.gains), weak], -1)
+        rows = xp.concatenate([near.rows(slopes), by_weak], -1)
         return NormalEquations.of(at, rows)
 
     def of(self, rows: np.ndarray) -> "AtKnots":

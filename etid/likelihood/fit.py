@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from etid.circuits.directions import DIRECTIONS, ON_LOADS, SEEN
+from etid.circuits.directions import ON_LOADS, SEEN
 from etid.likelihood import scores
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.linear import diagonal, inverse
@@ -137,17 +137,6 @@ class _Tested(NamedTuple):
 
 
 @held
-@array_function
-def shows_other_circuit(load: Load, q: Float[AnyArray, "*row q"]) -> Bool[AnyArray, "*row"]:
-    """Whether loads are other circuits than theirs with q, which need not be a minimum."""
-    near = Near.of(load, load.gains.at(load.knots.index), q)
-    seen = scores.seen(_Tested.of(load, near).each)
-    rows = [(DIRECTIONS[name], on) for name, on in seen.items()]
-    other = [on for row, on in rows if row.of_circuit and row.verdict == "misfit"]
-    return namespace(q).stack(other, -1).any(-1)
-
-
-@held
 def _estimate(load: Load, least: Minimum) -> Estimate:
     """Standard errors and tests of a minimum."""
     xp, gains = namespace(least.q), load.gains
@@ -164,14 +153,15 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
     fall = each["falling"].of_changes(0)
 
     squares, terms = 2 * profile.objective, records.terms
+    states = 0 if profile.states is None else profile.states.shape[-1]
     seen, relevant = scores.seen(each), scores.relevant(each)
-    over = squares - terms - UNSURE * xp.sqrt(2 * terms)
+    over = squares - terms + states - UNSURE * xp.sqrt(2 * terms)
     causes = (fall.z >= xp.abs(relevant).max(-1)) & (fall.explained > SHARE * over)
 
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
     made = (gain.others[..., None, None] * near.by_q(near.slopes)).sum(-3)
     of_gain = changes["gain"][..., 0, :, :] - made
-    explained = (as_complex(-gain.size)[..., None] * profile.x)[..., None, :]
+    explained = as_complex(-gain.size)[..., None, None] * profile.driving
     explained = profile.whitened(explained * every.between(of_gain))
     without = power(profile.innovations - explained) / profile.expected
     hum = shows_hum(profile.squares, records.frequency, records.used)
@@ -225,8 +215,8 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
         z=z,
         cov=own + shared + unknown,
         shared_cov=shared,
-        chi2=squares / (terms - owned),
-        rrse=rrse(load.records, profile.gains),
+        chi2=squares / (terms - owned - states),
+        rrse=rrse(load.records, profile),
         settled=least.settled,
         points=least.points,
         strain=strain,

@@ -152,7 +152,10 @@ class Gains:
         sizes = as_complex(of.faults + z @ of.faults_by_z)
         return [(DIRECTIONS[name], sizes[..., i, None]) for i, name in enumerate(ON_LOADS)]
 
-    def _turn(self, delays: Float[AnyArray, "*row output"]) -> Complex[AnyArray, "*row output bin"]:
+    def turn_at_few(
+        self, delays: Float[AnyArray, "*row output"]
+    ) -> Complex[AnyArray, "*row output bin"]:
+        """e^(−jωτ) of each output at frequencies that are no multiples of the first one."""
         cycles = -delays[..., None] * (self.frequency[..., None, :] / self.sample_rate)
         angle = 2 * np.pi * cycles
         return namespace(angle).cos(angle) + 1j * namespace(angle).sin(angle)
@@ -160,18 +163,22 @@ class Gains:
     def departing(self, q: Float[AnyArray, "*row q"], slopes: Slopes) -> At:
         """The loads, from which a recording may depart in any of `DIRECTIONS`."""
         logs, delays, _ = self.split(q)
-        each = slopes.gains, slopes.by_z, slopes.by_source, self._turn(delays)
+        each = slopes.gains, slopes.by_z, slopes.by_source, self.turn_at_few(delays)
         impedance = functools.partial(impedance_at, self.circuit, logs)
         return At(self.frequency, slopes.z, *each, impedance, bool(self.circuit.exponents()))
 
     def __call__(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
         """The gains at all harmonics."""
+        return self.undelayed(q) * self.turn(q)
+
+    def turn(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
+        """e^(−jωτ) of each output at all harmonics."""
         cycles = -self.split(q)[1] * (self.frequency[..., :1] / self.sample_rate)
-        return self.undelayed(q) * turns(cycles, self.frequency.shape[-1])
+        return turns(cycles, self.frequency.shape[-1])
 
     def at_few(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
         """The same at frequencies that are no multiples of the first one."""
-        return self.undelayed(q) * self._turn(self.split(q)[1])
+        return self.undelayed(q) * self.turn_at_few(self.split(q)[1])
 
     def undelayed(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
         """The same without the delays."""
@@ -198,7 +205,7 @@ class Gains:
         for of, size in faults:
             changed, slope = of.of_load(place, size)
             place, share = place._replace(z=changed), share * slope
-        at, turn = place.z, self._turn(delays)
+        at, turn = place.z, self.turn_at_few(delays)
         if self.source.loaded is None:
             current = xp.ones_like(at)
             loaded = by_total = xp.zeros_like(at)

@@ -132,7 +132,7 @@ def mismatch(calibrations: Calibrations, near: Near, linear: Linear) -> Mismatch
     best = xp.argmax(score**2 / own)
     made = combined(others[best], slopes.by_q.reshape(linear.jacobian.shape[0], -1))
     change = (made.reshape(slopes.gains.shape) - changes[best]) * (score / own)[best]
-    at = calibrations.profiles(near.profiles[0].gains + every.between(change))
+    at = calibrations.profiles(near.q, near.profiles[0].gains + every.between(change))
     noise = near.condensed.means(near.profiles, every, calibrations.noise(at)[None])[0]
     of_priors = ((others @ linear.precision) * others).sum(1)
     error = xp.sqrt((noise * directions**2).sum(1) + of_priors) / own

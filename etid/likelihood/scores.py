@@ -221,13 +221,13 @@ def rough(
     """
     xp, profile = namespace(added), near.profile
     weighted = profile.weighted(profile.whitened(added))
-    parts = xp.conj(weighted) * (profile.x * as_complex(share))[..., None, :]
+    parts = xp.conj(weighted) * (profile.driving * as_complex(share)[..., None, :])
     sums = knots.summed(xp.stack([parts.real, parts.imag], -3))
     by_q = near.by_q(near.slopes)
     told = by_q.real * sums[..., :1, :, :] - by_q.imag * sums[..., 1:, :, :]
     others = (told.sum((-2, -1))[..., None, :] @ linear.bread)[..., 0, :]
     made = (others[..., None, None] * by_q).sum(-3)
-    direction = added - profile.x[..., None, :] * knots.between(made)
+    direction = added - profile.driving * knots.between(made)
     total = (xp.conj(direction) * profile.pull).real.sum((-2, -1))
     total = total + (others * linear.pull).sum(-1)
     of_priors = ((others @ linear.spread) * others).sum(-1)
@@ -247,6 +247,8 @@ def falling(near: Near, knots: Knots) -> Complex[AnyArray, "*row output bin"]:
     xp, slopes = namespace(near.q), near.slopes
     relaxing = slopes.z - slopes.z[..., -1:].real  # without the series resistor
     v_out = knots.between(slopes.gains[..., 0, :]) * near.profile.x
+    if near.profile.made is not None:
+        v_out = v_out + near.profile.made[..., 0, :]
     count = min(HARMONICS, v_out.shape[-1])
     u = (v_out * knots.between(relaxing * reciprocal(slopes.z)))[..., :count]
     # There is no direct voltage behind a transformer, or with charge-balanced pulses.

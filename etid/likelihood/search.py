@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from etid.circuits.circuit import with_slopes
 from etid.likelihood.gains import Gains, Slopes
 from etid.likelihood.linear import (
     Arrays,
@@ -30,11 +31,12 @@ from etid.likelihood.linear import (
     replaced,
     taken,
 )
-from etid.likelihood.profile import Condensed, Profile, Records
+from etid.likelihood.profile import Condensed, Profile, Records, States
 from etid.likelihood.shared import Unloaded
+from etid.likelihood.transient import Transient, orders, relaxations
 from etid.precision import array_function, held, in_turn, namespace
 from etid.signals.knots import DENSITY, Knots, knots
-from etid.signals.transfer import AnyArray, as_complex, reciprocal
+from etid.signals.transfer import AnyArray, as_complex, frequency_variable, reciprocal
 
 ROWS = 32  # loads side by side: more leave the cache of a processor, fewer cost calls
 POINTS = 100  # largest number of points; below 24 dB some fits take dozens
@@ -45,6 +47,7 @@ NO_BETTER = 0.3
 IDLE = 3  # points in a row with a reduction below the rounding errors of ½ Σ r²
 ROUNDING = 1e-6  # of ½ Σ r²
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
+WRONG = 1.5  # χ² of a minimum with states, from which on other starts are tried; wrong ones had 2.7
 STEPS = 50  # largest number of steps at the knots of one point
 FARTHEST = 3.0  # scale of a step in the logarithm of an element, and in a delay [samples]
 DISTANT = 0.1  # part of ½ Σ r² that a step promises, above which a point is distant
@@ -64,6 +67,8 @@ class Load:
         width: Prior standard deviations of the parameters; infinite without a prior.
         unloaded: X that the calibrations estimate; None if the recordings share none with them.
         density: Of the knots (`etid.signals.knots.knots`).
+        transient: What the states at the ends of the records are made of; None if the recordings
+            are of whole periods.
     """
 
     gains: Gains
@@ -72,6 +77,7 @@ class Load:
     width: Float[AnyArray, " q"]
     unloaded: Unloaded | None = None
     density: int = dataclasses.field(default=DENSITY, metadata={"static": True})
+    transient: Transient | None = None
 
     @property
     def knots(self) -> Knots:
@@ -82,7 +88,9 @@ class Load:
         """Some of the rows."""
         unloaded = self.unloaded and self.unloaded.of(rows)
         gains, records = self.gains.of(rows), self.records.of(rows)
-        return dataclasses.replace(self, gains=gains, records=records, unloaded=unloaded)
+        transient = self.transient and self.transient.of(rows)
+        of = {"gains": gains, "records": records, "unloaded": unloaded, "transient": transient}
+        return dataclasses.replace(self, **of)
 
     def known(self, q: Float[AnyArray, "*row q"]) -> Records:
         """The records with the X that the calibrations estimate."""
@@ -98,8 +106,33 @@ class Load:
     @array_function
     def objective(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row"]:
         """½ Σ r² of all terms."""
-        profile = Profile.of(self.known(q), self.gains(q))
+        profile = self.profile(q, self.gains.at(self.knots.index))[0]
         return profile.objective + 0.5 * (self.rest(q) ** 2).sum(-1)
+
+    def profile(
+        self, q: Float[AnyArray, "*row q"], at_knots: Gains
+    ) -> tuple[Profile, States | None]:
+        """The likelihood at all harmonics, and what the states make of the outputs."""
+        records, gains = self.known(q), self.gains(q)
+        if self.transient is None:
+            return Profile.of(records, gains), None
+        z, frequency = at_knots.impedance(q), self.gains.frequency
+        degrees = orders(type(self.gains.circuit))
+        of = relaxations(degrees, at_knots.frequency, z, frequency).values
+        states = self.transient.states(gains, self.gains.turn(q)[..., 0, :], of)
+        return Profile.of(records, gains, states), states
+
+    def at_knots(self, q: Float[AnyArray, "*row q"], at_knots: Gains) -> Profile:
+        """The likelihood of the harmonics at the knots alone."""
+        records = Records(*(each[..., self.knots.index] for each in self.known(q)))
+        gains, states = at_knots.at_few(q), None
+        if self.transient is not None:
+            f, turn = at_knots.frequency, at_knots.turn_at_few(at_knots.split(q)[1])
+            degrees = orders(type(self.gains.circuit))
+            of = relaxations(degrees, f, at_knots.impedance(q), f).values
+            transient = self.transient.at(self.knots.index)
+            states = transient.states(gains, turn[..., 0, :], of)
+        return Profile.of(records, gains, states)
 
 
 class Near(NamedTuple):
@@ -113,6 +146,8 @@ class Near(NamedTuple):
         slopes: The gains and their derivatives at the knots.
         by_x: Relative derivatives of X with respect to z at the knots; None if X does not depend
             on z.
+        states_by_q: Derivatives of what the states make of the outputs at the knots, but for those
+            by the gains; None without states.
     """
 
     q: Float[AnyArray, "*row q"]
@@ -121,21 +156,25 @@ class Near(NamedTuple):
     condensed: Condensed
     slopes: Slopes
     by_x: Complex[AnyArray, "*row z knot"] | None
+    states_by_q: Complex[AnyArray, "*row q output knot"] | None = None
 
     @classmethod
     def of(cls, load: Load, at_knots: Gains, q: Float[AnyArray, "*row q"]) -> "Near":
         """The likelihood near q."""
-        profile, every = Profile.of(load.known(q), load.gains(q)), load.knots
+        (profile, states), every = load.profile(q, at_knots), load.knots
         objective = profile.objective + 0.5 * (load.rest(q) ** 2).sum(-1)
         by_x = None
         if load.unloaded is not None:
             xp, size = namespace(q), profile.size[..., :1, :]
-            moved = load.unloaded.x_by_z * reciprocal(profile.x)[..., None, :]
+            moved = load.unloaded.x_by_z * reciprocal(profile.driving[..., :1, :])
             sums = every.summed(xp.concatenate([size, size * moved.real, size * moved.imag], -2))
             total, (real, imag) = sums[..., :1, :], xp.split(sums[..., 1:, :], 2, -2)
             by_x = (real + 1j * imag) / as_complex(xp.where(total > 0, total, 1.0))
         slopes = at_knots.slopes(q)
-        return cls(q, objective, profile, Condensed.of([profile], every), slopes, by_x)
+        condensed, by_q = Condensed.of([profile], every, states), None
+        if load.transient is not None:
+            by_q = _states_by_q(load, at_knots, q, profile, slopes)
+        return cls(q, objective, profile, condensed, slopes, by_x, by_q)
 
     def by_q(self, slopes: Slopes) -> Complex[AnyArray, "*row q output knot"]:
         """Derivatives of G X/X̂ with respect to the parameters."""
@@ -156,7 +195,46 @@ class Near(NamedTuple):
     @property
     def jacobian(self) -> Float[AnyArray, "*row q part"]:
         """Transposed Jacobian of the condensed terms."""
-        return self.condensed.rows(self.by_q(self.slopes))
+        return self.rows(self.slopes)
+
+    def rows(self, slopes: Slopes) -> Float[AnyArray, "*row q part"]:
+        """Derivatives of the condensed terms at other gains."""
+        return self.condensed.rows(self.by_q(slopes), self.states_by_q)
+
+    def terms(
+        self, q: Float[AnyArray, "*row q"], slopes: Slopes, z: Float[AnyArray, "*row z"]
+    ) -> Float[AnyArray, "*row part"]:
+        """The condensed terms at q, with z that are so much larger than those of the point."""
+        states = None
+        if self.states_by_q is not None:
+            states = (as_complex(q - self.q)[..., None, None] * self.states_by_q).sum(-3)
+        return self.condensed.terms(self.moved(slopes, z), states)
+
+
+def _states_by_q(
+    load: Load, at_knots: Gains, q: Float[AnyArray, "*row q"], profile: Profile, slopes: Slopes
+) -> Complex[AnyArray, "*row q output knot"]:
+    """∂/∂q of what the states make, at the same X − V: by the decays of the load, and its delay."""
+    assert load.transient is not None
+    assert profile.states is not None
+    xp, count, e = namespace(q), load.transient.decays.shape[0], at_knots.elements
+    logs, delays, _ = at_knots.split(q)
+    f, every = at_knots.frequency, load.gains.outputs.count
+    z, by_element = with_slopes(load.gains.circuit, logs, f)
+    of = relaxations(orders(type(load.gains.circuit)), f, z, f, by_element)
+    p = profile.states[..., count : count + of.values.shape[-2]]
+    whole = (as_complex(p)[..., None] * of.values).sum(-2)[..., None, :]
+    turn, first = at_knots.turn_at_few(delays)[..., :1, :], np.eye(every)[0][:, None]
+    own = first * turn
+    by_voltage = own - slopes.gains if load.transient.behind else own + 0 * slopes.gains
+    moved = xp.zeros((*q.shape[:-1], e, f.shape[-1]), complex)
+    if of.by_logs is not None:
+        moved = of.by_logs * whole
+    by_logs = moved[..., None, :] * by_voltage[..., None, :, :]
+    s = frequency_variable(f / load.gains.sample_rate)[..., None, :]
+    by_delay = (-s * whole * own)[..., None, :, :]
+    rest = xp.zeros((*q.shape[:-1], q.shape[-1] - e - 1, every, f.shape[-1]), complex)
+    return xp.concatenate([by_logs, by_delay, rest], -3)
 
 
 def _equations(
@@ -168,8 +246,8 @@ def _equations(
     Rockafellar 1976). At the minimum it has no effect.
     """
     xp, at, split = namespace(q), near.q, load.gains.split
-    rows = near.condensed.rows(near.by_q(slopes))
-    terms = near.condensed.terms(near.moved(slopes, split(q)[2] - split(at)[2]))
+    rows = near.rows(slopes)
+    terms = near.terms(q, slopes, split(q)[2] - split(at)[2])
     prior, owned = 1 / load.width, load.gains.owned
     close = np.where(np.arange(q.shape[-1]) < owned, 1 / FARTHEST, 0.0)
     rest, off = load.rest(q), close * (q - at)
@@ -258,8 +336,30 @@ def minimum(
     """
     least = _search(load, starts, aside)
     if namespace(least.q) is np:
-        return least
+        return least if load.transient is None else _searched_again(load, starts, aside, least)
     return least._replace(q=_with_derivative(least.q, least.near, load))
+
+
+def _searched_again(
+    load: Load,
+    starts: Float[np.ndarray, "start row q"],
+    aside: Float[np.ndarray, ""] | float,
+    least: Minimum,
+) -> Minimum:
+    """The minima, some of them from other starts, in NumPy.
+
+    A record that begins in a pulse does not show how its likeliest start is wrong by its states.
+    """
+    for start in starts[1:]:
+        wrong = ~(2 * least.near.objective < WRONG * load.records.terms)
+        if not wrong.any():
+            break
+        rows = np.flatnonzero(wrong)
+        other = _search(load.of(rows), start[None, rows], aside)
+        deeper = other.near.objective < least.near.objective[rows]
+        if deeper.any():
+            least = replaced(least, rows[deeper], taken(other, deeper))
+    return least
 
 
 @jax.custom_jvp
@@ -363,11 +463,10 @@ def _best(
 
     The harmonics at the knots tell starts apart, at a fifteenth of the time of all.
     """
-    xp, index = namespace(starts), load.knots.index
-    few = Records(*(each[..., index] for each in load.known(starts[0])))
-    objectives = Profile.of(few, at_knots.at_few(starts)).objective
+    xp, used = namespace(starts), load.records.used[..., load.knots.index]
+    objectives = load.at_knots(starts, at_knots).objective
     objectives = objectives + 0.5 * (load.rest(starts) ** 2).sum(-1)
-    place = likeliest(objectives, few.terms)
+    place = likeliest(objectives, 2.0 * used.sum((-2, -1)))
     return xp.take_along_axis(starts, place[None, ..., None], 0)[0]
 
 

@@ -69,6 +69,8 @@ class Source(NamedTuple):
         delay_width: Prior standard deviation of the trigger delay of a load [samples].
         tolerances: Errors of the instrument that have tolerances; None without any.
         errors: What errors of the instrument do; None behind a measured current.
+        decays: What a voltage of each of its states looks like, per unit of it; None if no record
+            needs them.
     """
 
     frequency: Float[AnyArray, " bin"]
@@ -81,6 +83,7 @@ class Source(NamedTuple):
     delay_width: Float[AnyArray, ""]
     tolerances: Tolerances | None = None
     errors: Errors | None = None
+    decays: Complex[AnyArray, "decay bin"] | None = None
 
     def at(self, index: np.ndarray) -> "Source":
         """The same at some of the harmonics."""
@@ -93,6 +96,7 @@ class Source(NamedTuple):
             w_slope=self.w_slope[index],
             by_z=self.by_z[:, index],
             tolerances=of,
+            decays=None if self.decays is None else self.decays[:, index],
         )
 
     def w(

@@ -25,8 +25,7 @@ from etid.identify.skins import successful
 from etid.nonlinear.amplitudes import Amplitudes, currents
 from etid.nonlinear.fit import fit_amplitudes
 from etid.nonlinear.response import Recorded, with_filter
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, in_float64
+from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.errors import RecordingError
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording

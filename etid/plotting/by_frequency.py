@@ -19,16 +19,15 @@ from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import PREFIXES, several
+from etid.estimators.estimator import NOISE
 from etid.estimators.lanes import Harmonics
 from etid.estimators.registry import named
-from etid.identify.options import for_calibrations
 from etid.plotting.bands import fitted, used
 from etid.plotting.style import BLUE, INK, plain_ticks
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
-from etid.results.fits import AND
 
 PER_DECADE = 10  # bands
 FEWEST = 4  # harmonics of a band at least: their mean is known to 50 %
@@ -53,13 +52,10 @@ class ByFrequency:
     which: str
 
 
-def in_time(seen: Inspected, found: Fit | Driver) -> bool:
-    """Whether samples of a recording were fitted, whose noise is taken for white."""
-    method = str(found.method)
-    if AND in method:  # of a batch, where etid chose the method of each recording
-        method = str(for_calibrations(None, [seen]))
+def is_white(found: Fit | Driver) -> bool:
+    """Whether the method of a fit takes noise for white."""
     try:
-        return not named(method).lane.periodic
+        return named(str(found.method)).describe().noise == NOISE
     except ValueError:  # joint fits and others, all at harmonics
         return False
 
@@ -82,7 +78,7 @@ def by_frequency(
     size = seen.noise.power.shape[-1]  # padded harmonics follow
     lane = Harmonics(*(of[:size] if np.ndim(of) else of for of in jax.tree.leaves(lane)))
     samples = seen.periods[1]
-    if in_time(seen, found):
+    if is_white(found):
         white = np.square(seen.trusted) / samples
         lane = dataclasses.replace(
             lane, variance_x=np.full(size, white[0]), variance_y=np.full(size, white[1])
@@ -98,7 +94,7 @@ def by_frequency(
 def _which(seen: Inspected, found: Fit | Driver) -> str:
     """The noise in words: by what it was measured, or white."""
     bins = int(seen.noise.bins.min())
-    if in_time(seen, found) or bins == 0:
+    if is_white(found) or bins == 0:
         return "white noise"
     where = "between the harmonics" if seen.periods[0] > 1 else "in the quiet part"
     return f"noise {where} ({several(bins, 'bin')})"

@@ -110,7 +110,7 @@ class Inspection:
         of, samples = self._of_whole, self._shown[1]
         if self.mismatch and self.periods[0]:
             samples = self.recorded.shape[2]
-            of = noise_of(self.recorded, 1, samples)
+            of = noise_of(self.recorded, 1, samples, whole=False)
         return np.maximum(of.std(samples), self.step / math.sqrt(12.0))
 
     @property
@@ -126,7 +126,8 @@ class Inspection:
     def _noise(self, records: Float[np.ndarray, "recording 2 time"]) -> Noise:
         periods, samples = self._shown
         rest = periods * self.spacing - samples
-        return noise_of(records, periods, samples, np.repeat(rest[:, None], 2, axis=1))
+        of_both = np.repeat(rest[:, None], 2, axis=1)
+        return noise_of(records, periods, samples, of_both, self.periods[0] > 0)
 
     @functools.cached_property
     @quietly()

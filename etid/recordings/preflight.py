@@ -11,8 +11,9 @@ from etid.recordings.inspection import Inspection, together
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals.averaging import Aliases
+from etid.signals.bins import Bins, bins
 from etid.signals.lags import shifted
-from etid.signals.noise import Noise
+from etid.signals.noise import Noise, floor
 
 
 class Inspected:
@@ -99,11 +100,35 @@ class Inspected:
         if self.by_current is not None:
             self.by_current.lag += v_out - current
         self.lag += v_out
+        vars(self).pop("bins", None)
 
     @property
     def aligned(self) -> tuple[Float[np.ndarray, " overlap"], Float[np.ndarray, " overlap"]]:
         """Both voltages [V] in their overlap after the shift by `lag`."""
         return shifted(self.v_th, self.v_out, self.lag)
+
+    @functools.cached_property
+    def bins(self) -> Bins:
+        """Both voltages at the bins of their overlap."""
+        return self.bins_of_first(self.aligned[0].size)
+
+    def bins_of_first(self, samples: int) -> Bins:
+        """The same of the first samples of their overlap."""
+        periods, (v_th, v_out) = self.periods, self.aligned
+        return bins(
+            np.stack([v_th[:samples], v_out[:samples]]),
+            self.recording.sample_rate,
+            (self.noise, *periods) if periods[0] > 1 else None,
+            np.asarray(floor(self.limits, self.inspection.step[self.row])),
+            np.asarray(self.coarse),
+            periods[0] > 0 and self.has_no_aliases,
+            self.has_current,
+        )
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the recording holds whole periods whose aliases are known."""
+        return self.is_periodic and (self.periods[0] > 1 or self.has_no_aliases)
 
     @property
     def spectrum(self) -> tuple[np.ndarray, ...]:

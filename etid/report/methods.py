@@ -18,10 +18,10 @@ import etid.online.state  # these modules describe their methods
 from etid.circuits.display import as_symbol, quantity, several
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, described
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, described
 from etid.report.html import Section, Table, template
 from etid.results.driver import ContinuousDriver
-from etid.results.fits import AND, Fits, joined
+from etid.results.fits import AND, Fits
 from etid.results.study_fits import Settings, StudyFits
 from etid.selection.common import LIMIT
 
@@ -101,7 +101,6 @@ def _facts(
         "circuit": type(fits.circuit).__name__,
         "formula": fits.circuit.formula,
         "words": words(_method(found)),
-        "automatic": fits.fit.method == joined([str(MAXIMUM_LIKELIHOOD), str(OUTPUT_ERROR)]),
         "version": etid.__version__,
         "succeeded": succeeded(fits),
         "typical": typical,

@@ -84,7 +84,7 @@ class Calibration(Overviewed, Module):
             other calibrations, and the standard error of this difference. None for one
             calibration, or if not known.
         across: Capacitance across each known resistor that the other calibrations do not show, and
-            its standard error [F]; None in the same cases, and by output error.
+            its standard error [F]; None in the same cases.
         errors: Errors of the instrument that several calibrations show [standard deviations that an
             `Instrument` states]; None if they are 0.
     """
@@ -325,10 +325,6 @@ class ContinuousDriver(Driver):
     def r_known(self) -> Float[AnyArray, ""]:
         """Resistor of the first calibration [Ω]."""
         return self.calibration.r_load[0]
-
-    def late_std(self, sample_rate: Float[Array, ""]) -> Float[Array, ""]:
-        """Standard deviation of the delay of the calibrations [samples at this rate, in Hz]."""
-        return self.calibration.delay_std_samples * (sample_rate / self.sample_rate)
 
     def response(self, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """Source impedance Z_th [Ω] in continuous time at real frequencies [Hz]."""

@@ -210,10 +210,6 @@ class MeasuredCurrent(AbstractFeed):
         """Covariance of the parameters of the source, of which there are none."""
         return jnp.zeros((0, 0))
 
-    def late_std(self, sample_rate: Float[Array, ""]) -> Float[Array, ""]:
-        """Standard deviation of the delay of the calibration [samples]: almost 0, it is known."""
-        return jnp.full_like(sample_rate, 1e-9)
-
     def _overview(self) -> Overview:
         return Overview("Measured current", [])
 

@@ -120,7 +120,7 @@ class StudyFits(Overviewed):
         fits: One fit for each loaded recording.
         drivers: The drivers. The keys are the paths of their calibrations. Drivers from a file can
             predict and have standard errors. They hold no harmonics of their calibrations, so they
-            can be used with output error, not with maximum likelihood.
+            serve fits, but no joint fit.
         failures: Reasons why a driver could not be identified. The keys are the paths of its
             calibrations.
         settings: Settings of the run; None if the file does not hold them.

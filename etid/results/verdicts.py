@@ -26,7 +26,7 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
 
     unstable = (
         "The identified filters are unstable with this load: they cannot predict the voltage. "
-        "Use the method output_error, or repeat the calibration with less noise."
+        "Use the default method, or repeat the calibration with less noise."
     )
     nonphysical = (
         "An element is negative or not a number, an exponent exceeds 1, or the source impedance "
@@ -115,7 +115,7 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     not_periodic = (
         "The record holds no whole pulse period, or begins in the middle of an edge. "
-        "Record a whole number of periods, or use the method output_error."
+        "Record a whole number of periods, or use the default method."
     )
     unreadable = "The recording could not be read from its file; `etid check` says why."
     driver_failed = (
@@ -225,11 +225,11 @@ def message(name: str, spectrum: bool = False) -> str:
     if name == "max_steps_reached":  # lineax recommends an argument that etid does not have
         return (
             "The iteration did not converge; the fit reports the best iterate. "
-            "Average more periods, or use the method output_error."
+            "Average more periods."
         )
     if name == "nonfinite":  # optimistix names no cause
         return (
             "inf or NaN appeared during the fit. Most likely the numbers are far from those of an "
-            "electrode: check the units and r_load, or use the method output_error."
+            "electrode: check the units and r_load."
         )
     return RESULTS[RESULTS._name_to_item[name]]

@@ -30,6 +30,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +56,8 @@ class Spectrum(Module):
         variance_x: E|noise|² of each coefficient of `x` [V²].
         variance_y: E|noise|² of each coefficient of `y` [V²].
         selected: Harmonics that are used; all of them if aliases fall between them.
+        whole: Whether the records are whole periods. If not, these are the bins of the transform of
+            any record, but for bin 0.
     """
 
     frequency: Float[AnyArray, "*lane harmonic"]
@@ -63,6 +66,7 @@ class Spectrum(Module):
     variance_x: Float[AnyArray, "*lane harmonic"]
     variance_y: Float[AnyArray, "*lane harmonic"]
     selected: Bool[AnyArray, "*lane harmonic"]
+    whole: bool = eqx.field(static=True, default=True)
 
 
 def same_unloaded(

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.precision import array_function, namespace
-from etid.signals.transfer import AnyArray, from_parts, reciprocal
+from etid.signals.transfer import AnyArray, as_complex, from_parts, reciprocal
 
 SECTION = 4  # parameters of a section; a real pole has two, the constant one
 
@@ -87,3 +87,57 @@ def with_slopes(
     ]
     whole = constant[..., 0, :] + section.sum(-2) + single.sum(-2)
     return whole, xp.concatenate(slopes, -2)
+
+
+@array_function
+def decays(
+    parameters: Float[AnyArray, "*#row parameter"],
+    sections: int,
+    frequency: Float[AnyArray, "*#row bin"],
+) -> Complex[AnyArray, "*row decay bin"]:
+    """Transforms [s] of decays that begin with 1, one for each state, at frequencies [Hz].
+
+    They are 1/ω / (1 + 2ζx + x²) and x/ω / (1 + 2ζx + x²) of each section, and 1 / (ω + s) of each
+    real pole: Z with other gains and without its constant part.
+    """
+    xp, slopes = namespace(parameters, frequency), with_slopes(parameters, sections, frequency)[1]
+    of = _Modes.of(parameters, sections)
+    first, reals = 1 + 2 * sections, of.log_omega_real.shape[-2]
+    omega = [of.log_omega, of.log_omega, of.log_omega_real]
+    shapes = [slopes[..., first : first + 2 * sections, :], slopes[..., -reals:, :]]
+    return xp.concatenate(shapes, -2) * as_complex(xp.exp(-xp.concatenate(omega, -2)))
+
+
+@array_function
+def decays_by_parameters(
+    parameters: Float[AnyArray, "*row parameter"],
+    sections: int,
+    sizes: Float[AnyArray, "*row record decay"],
+    frequency: Float[AnyArray, " bin"],
+) -> Complex[AnyArray, "*row record parameter bin"]:
+    """Derivatives of sums of `decays` of these sizes with respect to the parameters."""
+    xp, of = namespace(parameters, sizes), _Modes.of(parameters, sections)
+    omega = xp.exp(xp.concatenate([of.log_omega, of.log_omega, of.log_omega_real], -2))[..., 0]
+    gains, reals = sizes / omega[..., None, :], of.log_omega_real.shape[-2]
+    wide = xp.broadcast_to(parameters[..., None, :], (*sizes.shape[:-1], parameters.shape[-1]))
+    first = 1 + 2 * sections
+    shapes = wide[..., 1:first], gains[..., : 2 * sections], wide[..., -2 * reals : -reals]
+    alike = xp.concatenate([wide[..., :1], *shapes, gains[..., 2 * sections :]], -1)
+    _, slopes = with_slopes(alike, sections, frequency)
+    of_gains = slopes[..., first : first + 2 * sections, :] * as_complex(
+        gains[..., : 2 * sections, None]
+    )
+    both = of_gains[..., :sections, :] + of_gains[..., sections:, :]
+    of_reals = slopes[..., -reals:, :] * as_complex(gains[..., 2 * sections :, None])
+    none = xp.zeros_like(slopes)
+    return xp.concatenate(
+        [
+            none[..., :1, :],
+            slopes[..., 1 : 1 + sections, :] - both,
+            slopes[..., 1 + sections : first, :],
+            none[..., : 2 * sections, :],
+            slopes[..., -2 * reals : -reals, :] - of_reals,
+            none[..., :reals, :],
+        ],
+        -2,
+    )

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from etid.precision import Module
 from etid.signals.harmonics import namespace
-from etid.signals.quiet_parts import are_loud, changes, window_of
+from etid.signals.quiet_parts import BLOCKS, are_loud, changes, window_of
 from etid.signals.transfer import AnyArray
 from etid.signals.white_noise import noise_std, quietest
 
@@ -147,6 +147,7 @@ def noise_of(
     periods: int,
     samples: int,
     rest: Float[np.ndarray, "*record"] | float = 0.0,
+    whole: bool = True,
 ) -> Noise:
     """The noise of records.
 
@@ -155,9 +156,10 @@ def noise_of(
         periods: Number of periods from `etid.signals.harmonics.whole_periods`; 1 if it is 0.
         samples: Number of samples from there; all of them if there is no period.
         rest: By how much the periods are longer [samples].
+        whole: Whether the record ends where it begins; if not, its ends are left out.
     """
     v = v[..., :samples]
-    found, kept = _measured(v, periods)
+    found, kept = _measured(v, periods, whole)
     if isinstance(v, jax.Array):  # the choice of periods below depends on the values
         if periods > 1:
             return found
@@ -196,18 +198,18 @@ def _of_loud(
 
 
 def _measured(
-    v: Float[Array | np.ndarray, "*record time"], periods: int
+    v: Float[Array | np.ndarray, "*record time"], periods: int, whole: bool = True
 ) -> tuple[Noise, Float[Array | np.ndarray, "*record 1"]]:
     """The noise at each harmonic, and the part of the record that the window has kept."""
     xp, samples = namespace(v), v.shape[-1]
     layout = _layout(periods, samples)
     if xp is np:
         flat, some = v.reshape(-1, samples), max(TOGETHER // samples, 1)
-        parts = (_between(flat[i : i + some], periods) for i in range(0, len(flat), some))
+        parts = (_between(flat[i : i + some], periods, whole) for i in range(0, len(flat), some))
         each = map(np.concatenate, zip(*parts, strict=True))
         sums, kept, usual = (of.reshape(*v.shape[:-1], -1) for of in each)
     else:
-        sums, kept, usual = _between(v, periods)
+        sums, kept, usual = _between(v, periods, whole)
     means = _smooth(sums / (samples**2 * kept), layout.number)
     rise = xp.concatenate([xp.diff(means, axis=-1), xp.zeros_like(kept)], axis=-1)
     power, rise = (xp.take(of, layout.below, axis=-1) for of in (means, rise))
@@ -237,7 +239,7 @@ def _smooth(
 
 
 def _between(
-    v: Float[Array | np.ndarray, "*record time"], periods: int
+    v: Float[Array | np.ndarray, "*record time"], periods: int, whole: bool
 ) -> tuple[Array | np.ndarray, ...]:
     """Mean power of the bins between the harmonics in each band, after a window.
 
@@ -248,6 +250,9 @@ def _between(
     layout = _layout(periods, samples)
     change = changes(v, periods)
     loud = are_loud(change)
+    if not whole:  # a record that is never quiet has no loud parts
+        ends = np.arange(BLOCKS) % (BLOCKS - 1) == 0
+        loud = loud | (ends & loud.any(-1, keepdims=True))
     of_period = xp.where(loud[..., None, :], 0.0, change).sum(-1)
     middle = xp.sort(of_period, axis=-1)[..., [periods // 2]]
     mean = of_period.mean(-1)[..., None]

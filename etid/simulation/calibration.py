@@ -30,8 +30,7 @@ from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.linear import diagonal, inverse
 from etid.likelihood.search import Near
 from etid.likelihood.source_prior import delay_std
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, in_float64
+from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.hdf5 import read_calibrations
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording

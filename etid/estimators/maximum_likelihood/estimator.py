@@ -19,16 +19,18 @@ from etid.estimators.estimator import (
     NOISE_BY_FREQUENCY,
     AbstractEstimator,
     Description,
+    serving,
 )
 from etid.estimators.judgement import STRAINED
-from etid.estimators.lanes import AbstractLane, Harmonics, HarmonicsWithCurrent, taken
+from etid.estimators.lanes import AbstractLane, Bins, Harmonics, HarmonicsWithCurrent, taken
 from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import fit_one, fit_rows
 from etid.estimators.refined_driver import from_harmonics
 from etid.likelihood.of_calibrations import MISSING_POLE
 from etid.precision import is_traced
-from etid.results.driver import Driver, HarmonicDriver
+from etid.recordings.preflight import Inspected
+from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
@@ -95,7 +97,10 @@ _BOTH = (
 
 @dataclasses.dataclass(frozen=True)
 class MaximumLikelihood(AbstractEstimator):
-    """Maximum likelihood with noise on both records, on the harmonics of whole pulse periods.
+    """Maximum likelihood with noise on both records, for records of any length and start.
+
+    It takes the harmonics of several whole pulse periods, and all bins of any other record, with
+    the states at its ends.
 
     A driver is fitted to the bands of harmonics in which the pulse exceeds its noise
     (`etid.signals.knots.above_noise`), a load to all of them.
@@ -116,11 +121,18 @@ class MaximumLikelihood(AbstractEstimator):
     driver = HarmonicDriver
     current = True
     chooses = True
-    rows = True
 
     def __post_init__(self) -> None:
         if self.with_current:
             object.__setattr__(self, "lane", HarmonicsWithCurrent)
+
+    def lane_of(self, seen: Inspected) -> type[AbstractLane]:
+        """The harmonics of whole periods, or the bins of any other record."""
+        return self.lane if seen.is_whole else Bins
+
+    def lane_of_periods(self, periods: int) -> type[AbstractLane]:
+        """Harmonics if there are several periods."""
+        return self.lane if periods > 1 else Bins
 
     def fit_driver(
         self,
@@ -134,19 +146,27 @@ class MaximumLikelihood(AbstractEstimator):
 
     def known(
         self,
-        driver: HarmonicDriver | MeasuredCurrent,
+        driver: ContinuousDriver | MeasuredCurrent,
         frequency: Float[AnyArray, " harmonic"],
         shared: bool,
     ) -> GivenDriver:
         """The distribution of Z_th at the harmonics, given the calibrations; or the current."""
         if isinstance(driver, MeasuredCurrent):
             return GivenDriver.measured(frequency)
-        return given_driver.given(driver, frequency, shared)
+        if isinstance(driver, HarmonicDriver):
+            return given_driver.given(driver, frequency, shared)
+        return given_driver.by_covariance(driver, frequency)
+
+    def check_driver(self, driver: AbstractFeed, sample_rate: float) -> None:
+        """Raise ValueError unless the driver is a measured current, or has a covariance."""
+        del sample_rate
+        if not isinstance(driver, MeasuredCurrent):
+            serving(driver, ContinuousDriver, str(self))
 
     def fit_load(
         self,
         lane: Harmonics,
-        driver: HarmonicDriver | MeasuredCurrent,
+        driver: ContinuousDriver | MeasuredCurrent,
         known: GivenDriver,
         circuit: AbstractCircuit,
     ) -> Fit:
@@ -181,6 +201,8 @@ class MaximumLikelihood(AbstractEstimator):
             "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
             f"whose distribution the calibrations give.{_BOTH if self.with_current else ''}",
             (NO_OTHER_CIRCUIT, NO_OTHER_GAIN, NO_FALL),
-            "The trigger delay τ of each recording is one more unknown."
+            "The trigger delay τ of each recording is one more unknown. Records that are not "
+            "several whole periods were fitted at all bins of their transforms, with the states at "
+            "both ends as further unknowns."
             f"{stated(self.known_elements)}{stated_limits(self.bounds)}",
         )

@@ -46,11 +46,11 @@ from etid.likelihood.gains import FAULTS
 from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.likelihood.unloaded import UnloadedShape, shape_of
 from etid.precision import Module, array_function, namespace
-from etid.results.driver import HarmonicDriver
+from etid.results.driver import ContinuousDriver, HarmonicDriver
 from etid.results.instrument import BUDGETED, Instrument
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import AnyArray, as_complex, frequency_variable, reciprocal
-from etid.solvers.matrices import inverse_root
+from etid.solvers.matrices import inverse_root, root
 
 
 class InstrumentErrors(Module):
@@ -99,6 +99,7 @@ class GivenDriver(Module):
             not needed.
         aside: Distance of the first delay of a search from that of its start [samples].
         by_current: Whether the input is a measured current: the gain is Z_L, and there is no z.
+        decays: Those of the states of the driver, for records that are not of whole periods.
     """
 
     frequency: Float[AnyArray, " harmonic"]
@@ -118,6 +119,7 @@ class GivenDriver(Module):
     bend: Complex[AnyArray, " harmonic"] | None = None
     aside: Float[AnyArray, ""] = eqx.field(default_factory=lambda: np.zeros(()))
     by_current: bool = eqx.field(static=True, default=False)
+    decays: Complex[AnyArray, "decay harmonic"] | None = None
 
     @classmethod
     def measured(cls, frequency: Float[AnyArray, " harmonic"]) -> "GivenDriver":
@@ -135,6 +137,7 @@ class GivenDriver(Module):
             gains=None,
             gain_slopes=None,
             by_current=True,
+            decays=nothing[None][:0],
         )
 
 
@@ -198,6 +201,20 @@ def given(
 
 
 @array_function
+def by_covariance(driver: ContinuousDriver, frequency: Float[AnyArray, " harmonic"]) -> GivenDriver:
+    """The same of a driver without its calibrations, from its covariance."""
+    xp, deviations = namespace(frequency, driver.source.gain), root(driver.later_cov())
+    count, rate = driver.calibration.r_load.shape[0], xp.asarray(driver.sample_rate)
+    nothing = np.zeros((count, 0))
+    none = Spectrum(nothing, 1j * nothing, 1j * nothing, nothing, nothing, nothing > 0)
+    calibrations = Calibrations(driver.source, driver.calibration, none, rate)
+    common = calibrations.start()
+    directions = xp.pad(deviations, ((0, common.size - deviations.shape[0]), (0, 0)))
+    size = deviations.shape[1]
+    return around(calibrations, common, directions, frequency, False, np.zeros(size), np.eye(size))
+
+
+@array_function
 def around(
     calibrations: Calibrations,
     c: Float[AnyArray, " common"],
@@ -224,4 +241,5 @@ def around(
         gain_slopes=None if known is None else known.gains_by_z,
         delay_width=source.delay_width,
         faults=None if of is None else (of.faults, of.faults_by_z),
+        decays=source.decays,
     )

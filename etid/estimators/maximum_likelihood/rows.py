@@ -1,20 +1,20 @@
 """Loads fitted as rows of arrays, by `etid.likelihood`, behind a driver that is given."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, stacked
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
+from etid.estimators.lanes import Bins, Harmonics, HarmonicsWithCurrent, stacked
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.verdict import judged, judged_one
-from etid.likelihood.calibrations import Calibrations
-from etid.likelihood.fit import Estimate, fit, shows_other_circuit
+from etid.likelihood.fit import Estimate, fit
 from etid.likelihood.gains import Gains, Voltage, VoltageAndCurrent
 from etid.likelihood.profile import Records
 from etid.likelihood.search import ROWS, Load
@@ -22,16 +22,13 @@ from etid.likelihood.shared import Calibrated, Unloaded
 from etid.likelihood.source import Errors, Source, Tolerances
 from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.likelihood.starts import starts
+from etid.likelihood.transient import Transient, ends, width_of
 from etid.likelihood.unloaded import differs
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, namespace
-from etid.results.driver import HarmonicDriver
+from etid.precision import array_function, namespace, one_thread
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
 from etid.signals.harmonics import same_unloaded
-from etid.signals.transfer import AnyArray
-from etid.solvers.matrices import root
 
 
 def source_of(known: GivenDriver) -> Source:
@@ -47,7 +44,8 @@ def source_of(known: GivenDriver) -> Source:
         tolerances = Tolerances(*known.faults, known.bend, *bending)
     loaded = None if known.by_current else known.loaded
     numbers = known.w_slope, known.slope, known.resistance, known.mean, known.cov
-    return Source(known.frequency, loaded, *numbers, known.delay_width, tolerances, errors)
+    of_states = known.delay_width, tolerances, errors, known.decays
+    return Source(known.frequency, loaded, *numbers, *of_states)
 
 
 def calibrated(known: GivenDriver) -> Calibrated | None:
@@ -80,7 +78,14 @@ def load_of(
         same = same_unloaded(records.x[..., None, :], shared.x)
         unloaded = Unloaded.by(shared, records, same)
     gains = Gains(source, circuit, lane.frequency, lane.sample_rate.reshape(-1)[0], outputs)
-    return load_with(gains, records, prior, unloaded)
+    load = load_with(gains, records, prior, unloaded)
+    if not isinstance(lane, Bins):
+        return load
+    assert source.decays is not None
+    first, rate = lane.frequency.reshape(-1)[0], gains.sample_rate
+    of = source.decays * first, ends(lane.x.shape[-1]) * (first / rate), width_of(y, used)
+    transient = Transient(*of, behind=source.loaded is not None)
+    return dataclasses.replace(load, transient=transient)
 
 
 def load_with(
@@ -123,26 +128,6 @@ def fit_one(
         changed = differs(known.shape, load.records)
         found = found._replace(inconsistent=found.inconsistent | changed)
     return judged_one(found, circuit, driver.result, method, bounds, prior)
-
-
-def other_circuit_at(
-    lane: Harmonics,
-    own: Float[AnyArray, " own"],
-    circuit: AbstractCircuit,
-    driver: HarmonicDriver,
-) -> Bool[AnyArray, ""]:
-    """Whether the harmonics show another circuit than one that was fitted by another criterion.
-
-    Z_th varies within its covariance. The elements need not be at a minimum, because the part of
-    the residual that they could still explain is projected out.
-    """
-    calibrations, deviations = Calibrations.of(driver), root(driver.later_cov())
-    xp, common, count = namespace(own), calibrations.start(), deviations.shape[1]
-    directions = xp.pad(deviations, ((0, common.size - count), (0, 0)))
-    z, unit = np.zeros(count), np.eye(count)
-    known = around(calibrations, common, directions, lane.frequency, False, z, unit)
-    load = load_of(lane, source_of(known), circuit, None, None)
-    return shows_other_circuit(load, xp.concatenate([own, z]))
 
 
 def estimates(

@@ -18,8 +18,7 @@ from etid.estimators.judgement import BIASED, MAX_STEPS_REACHED, distance_to_min
 from etid.estimators.lanes import AlignedSamples, stacked
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.likelihood.linear import NormalEquations
-from etid.numpy_tier.algebra import one_thread
-from etid.precision import array_function, namespace, untraced
+from etid.precision import array_function, namespace, one_thread, untraced
 from etid.results.driver import DiscreteDriver, Driver
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
@@ -59,7 +58,6 @@ class SteiglitzMcBride(AbstractEstimator):
     lane = AlignedSamples
     driver = Driver
     any_circuit = False
-    rows = True
 
     iterations: int = iteration.ITERATIONS
 

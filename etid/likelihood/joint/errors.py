@@ -134,7 +134,7 @@ def at_minimum(
         jacobian = near.jacobian
         return AtMinimum(
             chi2=2 * profile.objective / (records.terms - own),
-            rrse=rrse(load.records, profile.gains),
+            rrse=rrse(load.records, profile),
             jacobian=jacobian,
             share=means[:, 0],
             noise=means[:, 1],

@@ -1,1 +1,0 @@
-"""Output error: the prediction in time, its fit by Levenberg-Marquardt, and its information."""

@@ -1,0 +1,125 @@
+"""Bins of the transform of a record of any length and start.
+
+They are k fs/N of a record of N samples, with k = 1 … up to `ALIASED` of the sample rate.
+`etid.likelihood.transient` says what the states at both ends of the record make of them.
+
+**Noise.** Where the record holds several pulse periods, the bins between their harmonics show it
+(`etid.signals.noise`). Otherwise its quiet parts do.
+
+**Aliases** of the edges of pulses fall on all bins, as on the harmonics of a period of whole
+samples (`etid.signals.harmonics`, which says how their size follows from the record). The band ends
+where they exceed the noise. Aliases of the ends of the record are smooth in frequency, and the
+likelihood has unknowns for them. So the ends are tapered before the spectrum is looked at.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from etid.signals.harmonics import ALIASED, aliases, filled, harmonics_of
+from etid.signals.noise import Noise, noise_of
+from etid.signals.rounding import rounding_variance
+from etid.signals.transfer import AnyArray, power
+
+TAPER = 48  # samples at each end, beyond which a jump there does not reach
+LEAST = 0.28  # of the sample rate; the band does not end below, or C_p is twice as uncertain
+TOO_LARGE = 6.0  # by which the power of aliases that a record tells of exceeds the true one
+# Power of aliases at `LEAST` relative to the noise, above which elements are wrong. Where they were
+# by five standard errors (100 kHz at 60 and 80 dB, 150 kHz at 80 dB) it was 54 and more, where they
+# were not (150 kHz at 50 dB, 200 kHz at 80 dB) at most 2.3.
+UNKNOWN = 10.0
+# A current has aliases if its power above `LAST` of the rate is surely above the noise, and above
+# this part of its power at a third of the rate. Steps have 0.03 to 0.16 after a filter of fourth
+# order at 0.4 of the rate, and at most 0.007 after one of eighth order at 0.3.
+LAST, STEPS, SURE = 0.45, 0.015, 5.0
+
+
+class Bins(NamedTuple):
+    """Both records of a recording at their bins.
+
+    Attributes:
+        fields: Those of an `etid.signals.harmonics.Spectrum`.
+        is_aliased: Whether aliases of unknown size exceed the noise. A current tells nothing of
+            this: its multisines end below half the sample rate, its edges do not.
+    """
+
+    fields: tuple[AnyArray, ...]
+    is_aliased: bool
+
+
+def bins(
+    both: Float[np.ndarray, "2 time"],
+    sample_rate: float,
+    noise: tuple[Noise, int, int] | None,
+    least: Float[np.ndarray, "2"],
+    coarse: Float[np.ndarray, "2"],
+    ended: bool,
+    of_current: bool,
+) -> Bins:
+    """The bins of two records.
+
+    Args:
+        both: The records.
+        sample_rate: Sampling rate [Hz].
+        noise: Noise at the harmonics of several periods, with their number and that of their
+            samples; None if there are no several periods.
+        least: Smallest noise of a sample of each record.
+        coarse: Step of a converter that exceeds the noise; else 0.
+        ended: Whether the spectra surely end below half the sample rate.
+        of_current: Whether the first record is a current.
+    """
+    size = both.shape[-1]
+    transform, count = harmonics_of(both, 1), math.ceil(ALIASED * size)
+    variance, of_ends = _noise(both, noise, transform.shape[-1])
+    variance = np.maximum(variance, least[:, None] ** 2 / size)
+    for row in np.flatnonzero(coarse):
+        variance[row] = rounding_variance(both[row], float(coarse[row]), 1, size)
+    usable = np.all((coarse > 0)[:, None] | ~of_ends, axis=0)[:count]
+    unknown = False
+    tapered = _tapered(both)
+    if not ended and not (of_current and not _goes_on(tapered[0], variance[0])):
+        least = math.ceil(LEAST * size)
+        of_aliases = aliases(tapered, variance, 1, size).power
+        found = (of_aliases / (TOO_LARGE * variance)).max(0)[:count]
+        unknown = bool(found[least - 1] > UNKNOWN) and not of_current
+        usable = usable & ((found < 1) | (np.arange(count) < least))
+    *fields, selected = filled(transform[:, :count], variance[:, :count], sample_rate, 1, size)
+    selected[:count] &= usable
+    return Bins((*fields, selected), unknown)
+
+
+def _noise(
+    both: Float[np.ndarray, "2 time"], noise: tuple[Noise, int, int] | None, count: int
+) -> tuple[Float[np.ndarray, "2 bin"], Bool[np.ndarray, "2 bin"]]:
+    """`Noise.variance` and `Noise.of_ends` of so many bins."""
+    size = both.shape[-1]
+    if noise is None:
+        found = noise_of(both, 1, size, whole=False)
+        return np.asarray(found.variance), np.asarray(found.of_ends)
+    of, periods, samples = noise
+    known = np.arange(1.0, of.power.shape[-1] + 1) * (periods / samples)
+    at = np.arange(1.0, count + 1) / size
+    power = np.stack([np.interp(at, known, one) for one in np.asarray(of.power)])
+    ends = np.stack([np.interp(at, known, one) > 0.5 for one in 1.0 * np.asarray(of.of_ends)])
+    return power * (samples / size), ends
+
+
+def _tapered(both: Float[np.ndarray, "2 time"]) -> Complex[np.ndarray, "2 bin"]:
+    """The bins of what lies between the ends."""
+    size = both.shape[-1]
+    middle = np.arange(size) + 0.5
+    window = np.sin(np.pi / 2 * np.clip(np.minimum(middle, size - middle) / TAPER, 0.0, 1.0)) ** 2
+    level = (both @ window / window.sum())[:, None]
+    return np.asarray(harmonics_of(window * (both - level), 1))
+
+
+def _goes_on(x: Complex[np.ndarray, " bin"], variance: Float[np.ndarray, " bin"]) -> bool:
+    """Whether the spectrum of a current goes on beyond half the sample rate."""
+    place = np.arange(1.0, x.size + 1) / (2 * (x.size + 1))
+    last, before = ((place >= low) & (place < low + 0.05) for low in (LAST, 0.3))
+    excess, noise = power(x) - variance, variance[last].mean()
+    found = excess[last].mean()
+    sure = found > SURE * noise / math.sqrt(np.count_nonzero(last))
+    return bool(sure and found > STEPS * excess[before].mean())
