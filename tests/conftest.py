@@ -64,34 +64,6 @@ def pytest_xdist_auto_num_workers():
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
 
 
-@pytest.fixture(autouse=True, scope="session")
-def _who_runs_programs(request):
-    """Ordinary tests run a program once or twice, slow ones hundreds of times.
-
-    So the ordinary ones have small programs run by NumPy, and batches compiled without passes of
-    LLVM, in half the time. Slow tests have everything compiled.
-    """
-    from etid.numpy_tier import tiers  # here, for the type checker wraps what it imports
-
-    by_numpy = tiers._by_numpy
-    with pytest.MonkeyPatch.context() as patch:
-        if _is_ordinary(request.config):
-            patch.setattr(tiers, "QUICKLY", tiers.AT_ONCE)
-        else:
-            patch.setattr(tiers, "_by_numpy", lambda: False)
-        yield by_numpy
-
-
-@pytest.fixture(scope="module")
-def run_as_for_users(_who_runs_programs):
-    """Slow tests are compiled; in this module they are run as in a process of a user."""
-    from etid.numpy_tier import tiers
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiers, "_by_numpy", _who_runs_programs)
-        yield
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _room_for_executables():
     yield

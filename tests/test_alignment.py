@@ -13,8 +13,6 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from tests.skins import DAMP, DRY, off
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 PULSE = 60.0
 LOADS = {"dry": DRY, "damp": DAMP, "resistor": etid.Resistor(21.62e3)}
 SIGMAS = 5.0  # one in 2 million for a normal error

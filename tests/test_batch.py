@@ -21,7 +21,6 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 from tests.skins import DRY, off
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
 LENGTH = 10_000
 SIGMAS = 5.0  # one in 2 million for a normal error, which the coverage test measures
 FEW = 16  # lanes of a call, so that few recordings need several calls

@@ -111,7 +111,6 @@ SMALLER = {
 }  # fmt: skip
 
 # Each program runs a few times, so that compilation would be most of the time.
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -20,8 +20,6 @@ from etid.results.verdicts import verdict
 from tests.test_current import SKIN, recorded
 from tests.test_judging import estimate
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 
 @pytest.fixture(scope="module")
 def noisy():

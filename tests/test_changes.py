@@ -18,8 +18,6 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import TransformerDriver
 from tests import pictures
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 NAMES = ("r_s", "r_p", "c_p")
 
 

@@ -12,8 +12,6 @@ from etid.signals.harmonics import ALIASED, aliases
 from etid.simulation.transformer import TransformerDriver
 from tests.skins import DAMP, DRY, off
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 SKINS = {"dry": DRY, "damp": DAMP}
 SIGMAS = 4.0  # one of 16 000 for a normal error; 600 elements are compared below
 

@@ -15,8 +15,6 @@ from etid.recordings.preflight import Inspected, preflight
 from tests import kept_numbers
 from tests.skins import off
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 RATE, PULSES = 200e3, 60.0
 SKIN = etid.SkinRC(33e3, 186e3, 0.12e-9)
 COLE = etid.SkinCole(2e3, 27e3, 1e-3, 0.85)

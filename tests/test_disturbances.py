@@ -16,8 +16,6 @@ from etid.signals.disturbances import joint
 from tests.skins import off
 from tests.test_changes import falling, recorded, trial
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 PERIOD = 1 / 60.0
 LEFT_OUT = int(Remark.periods_left_out)
 

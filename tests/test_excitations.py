@@ -6,8 +6,6 @@ import pytest
 import etid
 from etid.recordings.preflight import Inspected
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 RATE = 200e3
 TRUTH = np.array([33e3, 186e3, 0.12e-9])
 SKIN = etid.SkinRC(*TRUTH)

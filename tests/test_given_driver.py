@@ -14,8 +14,6 @@ from etid.signals.transfer import delayed
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 R_LOAD = 98.8e3
 KNOWN = (Trial("c", ResistorLoad(R_LOAD)),)
 

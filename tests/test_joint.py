@@ -16,8 +16,6 @@ from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from tests import kept_numbers
 from tests.skins import DAMP, DRY, off
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 KNOWN = (Trial("calibration/0", ResistorLoad(98.8e3)),)
 TRIALS = tuple(Trial(f"loaded/{i}", DRY, condition="dry") for i in range(6))
 TOGETHER = [trial.path for trial in TRIALS[:2]]  # with one unloaded record; each other has its own

@@ -8,7 +8,7 @@ from etid.recordings.remarks import Remark
 from tests.skins import DAMP, DRY, off, relative
 from tests.test_driver_and_current import LATE, WITHIN, late_record, scene
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("run_as_for_users")]
+pytestmark = pytest.mark.slow
 
 
 def jointly(recordings, **options):

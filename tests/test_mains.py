@@ -12,8 +12,6 @@ from etid.simulation import scenes
 from etid.simulation.scenes import Scene
 from tests import kept_numbers
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 SCALE = Scene().scale
 DRY = scenes.paper_dry()
 

@@ -10,8 +10,6 @@ import etid
 from etid.signals.missing import unmasked
 from tests.test_online import TEN, quiet, tracker_of
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 RATES: dict[str, Any] = {"sample_rate": 200e3, "pulse_rate": 60.0}
 F = np.geomspace(60.0, 1e5, 40)
 Z = etid.SkinRC(33.4e3, 186e3, 0.12e-9).response(F)

@@ -18,8 +18,6 @@ from etid.circuits.impedance import AbstractElement, AbstractIrrational
 from etid.signals.transfer import as_complex, reciprocal
 from etid.simulation.scenes import Trial
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 SIGMAS = 5.0  # one in 2e6; with a fixed seed a test passes always or never
 LADDER = 1e-3  # relative: what the netlist of a circuit may differ by in its band
 

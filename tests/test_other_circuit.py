@@ -21,8 +21,6 @@ from etid.likelihood.scores import Linear, Scores, doubt, seen, smooth
 from etid.precision import array_function
 from etid.simulation.scenes import Trial
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 
 def place(circuit, f):
     """A load at some frequencies, of which its impedance is used only."""

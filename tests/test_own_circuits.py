@@ -13,8 +13,6 @@ from etid.circuits.elements import Exponent, Ohm, PseudoCapacitance
 from etid.identify.predict import periodic_voltage
 from etid.simulation.scenes import Trial
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 LAYERS = etid.SkinLayers(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
 SPREAD = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.85)
 DRY = etid.SkinRC(33.4e3, 186e3, 0.12e-9)

@@ -90,12 +90,12 @@ def test_dependencies_have_lower_bounds_and_exact_versions_in_the_constraints(pr
         assert name.lower() in pinned, f"{name} is not in constraints.txt"
 
 
-def test_annotations_of_all_packages_but_the_translator_are_checked():
+def test_annotations_of_all_packages_are_checked():
     options = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["pytest"]
     found = [of for of in options["ini_options"]["addopts"] if of.startswith("--jaxtyping")]
     packages = {f"etid.{of.parent.name}" for of in (ROOT / "etid").glob("*/__init__.py")}
     checked = found[0].split("=")[1].split(",")
-    assert set(checked) == packages - {"etid.numpy_tier"} | {"beartype.beartype"}
+    assert set(checked) == packages | {"beartype.beartype"}
 
 
 def test_importing_prints_nothing_and_changes_no_setting():

@@ -13,8 +13,6 @@ import pytest
 import etid
 from etid.results.driver import DiscreteDriver
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 F = np.array([10.0, 1e3, 1e5])
 
 

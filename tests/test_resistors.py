@@ -8,8 +8,6 @@ from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 KNOWN = (98.8e3, 216.6e3)
 SIGMAS = 5.0  # one in 2 million for a normal error
 

@@ -11,8 +11,6 @@ from etid.signals.harmonics import harmonics
 from etid.simulation import scenes
 from etid.simulation.scenes import Scene
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 DRY = scenes.paper_dry()
 
 

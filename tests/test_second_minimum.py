@@ -9,8 +9,6 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad, loading
 from tests.skins import DAMP, off
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 RATE = 100e3
 DRIVERS = 8
 SIGMAS = 4.5  # one in 150 000 for a normal error

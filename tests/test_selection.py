@@ -24,8 +24,6 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 from tests.skins import off
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 CANDIDATES = usual_circuits()
 
 TERMS = 1000.0

@@ -11,8 +11,6 @@ from etid.recordings.remarks import Remark
 from tests.skins import off
 from tests.test_changes import falling, recorded
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 PERIOD = 10_000 / 3
 FAULTS = ("lost", "doubled")
 

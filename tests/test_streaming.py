@@ -28,7 +28,6 @@ PART = 4
 COUNT = 14  # three whole parts and a half
 
 # Worker processes run programs as users' do.
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
 
 @pytest.fixture(scope="module")

@@ -104,6 +104,7 @@ def test_the_decays_of_a_load_are_those_of_its_poles(circuit):
         left = one - basis @ np.linalg.lstsq(basis, one)[0]
         assert np.linalg.norm(left) < 1e-7 * np.linalg.norm(one)
     expected = differences(lambda logs: decays(logs).values, logs)
+    assert found.by_logs is not None
     found = found.by_logs[:, None] * found.values
     # The equations for two poles have a condition of 1e8.
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())

@@ -17,8 +17,6 @@ from etid.recordings.study import Study
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
-pytestmark = pytest.mark.usefixtures("run_as_for_users")
-
 USUAL = TransformerDriver()
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 
