@@ -270,7 +270,9 @@ def test_fits_of_a_file_and_fresh_ones_are_one_table(fits, driver, tmp_path):
     read = etid.Fits.read(tmp_path / "fits.h5")
     nothing = {"change": None, "change_stderr": None}
     bare = dataclasses.replace(part, fit=dataclasses.replace(part.fit, **nothing))
-    tolerances = Effects(np.ones((1, len(BUDGETED), 3)), np.zeros((1, len(BUDGETED))))
+    tolerances = Effects(
+        np.ones((1, len(BUDGETED), 3)), np.zeros((1, len(BUDGETED))), np.zeros((1, 3))
+    )
     joint = dataclasses.replace(part, fit=dataclasses.replace(part.fit, by_tolerance=tolerances))
     limits = Limited(np.zeros((1, 3)), np.full((1, 3), 1e6), np.zeros((1, 3)))
     bounded = dataclasses.replace(part, fit=dataclasses.replace(part.fit, limits=limits))

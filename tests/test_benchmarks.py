@@ -57,6 +57,9 @@ CASES = {
     ),
     "driver_order": ("--drivers 1 --snr-db 60 --orders 5 7 --data {}", "", "100 % right"),
     "fuzz": ("--files 3 --kind csv --output {}/f.json", "f.json", "0 faults in 3 files"),
+    "inexact": (
+        "--drivers 1 --snr-db 60 --sizes 0.002 --lengths 1 --workers 1", "", "within 1.96 ±",
+    ),
     "instruments": (
         "--quick --folder {0} --data {0}", "instruments.csv instruments.svg",
         "oscilloscope_12_bit: rms error / bound",

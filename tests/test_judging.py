@@ -11,17 +11,15 @@ import pytest
 import etid
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import (
-    MISFIT_CHI2,
-    MISFIT_RRSE,
     SUCCESSFUL,
     distance_to_minimum,
     judged,
-    misses,
     remarks,
     too_late,
     unless,
 )
 from etid.likelihood.linear import NormalEquations
+from etid.likelihood.noise import MISFIT_CHI2, MISFIT_RRSE, misses
 from etid.recordings.remarks import Remark
 from etid.results.verdicts import RESULTS, verdict
 

@@ -12,7 +12,7 @@ import scipy.stats
 import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.online_alarms import LOADS, Fingertip
-from etid.estimators.judgement import MISFIT_CHI2
+from etid.likelihood.noise import MISFIT_CHI2
 from etid.online.alarms import SEEN_IN_PULSES, SPREAD
 from etid.online.pulse_fit import GainModel
 from etid.online.tracker import Tracker

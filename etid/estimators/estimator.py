@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators import judgement
 from etid.estimators.lanes import AbstractLane, stacked
+from etid.likelihood.noise import MISFIT_CHI2, MISFIT_RRSE
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
@@ -29,8 +30,8 @@ CHECKED = (
     "the iteration converged",
     "all elements are positive",
     f"the residual does not exceed the noise (χ² per degree of freedom of at most "
-    f"{judgement.MISFIT_CHI2:g}, or an unexplained part of at most "
-    f"{100 * judgement.MISFIT_RRSE:g} % of the signal)",
+    f"{MISFIT_CHI2:g}, or an unexplained part of at most "
+    f"{100 * MISFIT_RRSE:g} % of the signal)",
 )
 DETERMINED = "the trigger delay is at most one sample, every relative standard error below 1"
 NEAR_MINIMUM = (

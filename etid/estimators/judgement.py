@@ -18,7 +18,7 @@ from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import Estimate
 from etid.likelihood.linear import NormalEquations
-from etid.precision import namespace
+from etid.likelihood.noise import misses
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Support
 from etid.results.instrument import Effects
@@ -29,30 +29,11 @@ from etid.solvers.matrices import inverse
 # Inherited from lineax; the type checker does not see them as members of our class.
 SUCCESSFUL = verdict("successful")
 MAX_STEPS_REACHED = verdict("max_steps_reached")
-MISFIT_CHI2 = 1.5  # the record gives the noise to about 5 %, so chi2 is known to 10 %
-MISFIT_RRSE = (
-    1e-3  # of the signal; the best converters and transformers leave this part unexplained
-)
 # Increase of the calibrations' sum of squares in a joint fit. Its distribution is chi-squared. The
 # degrees of freedom are at most the number of parameters of Z_th and the delays. With 12 degrees of
 # freedom the increase exceeds this value once in ten thousand.
 STRAINED = 39.0
 BIASED = 16.0  # squared standard errors from an estimate to the minimum of its model
-
-
-def misses(
-    chi2: Float[AnyArray, "*row"],
-    error: Float[AnyArray, "*row"],
-    least: float = MISFIT_RRSE,
-    limit: float = MISFIT_CHI2,
-) -> Bool[AnyArray, "*row"]:
-    """Whether the residual exceeds the noise, both in standard deviations and in volts.
-
-    A part `least` of the signal may remain unexplained, and noise explains a χ² of `limit`.
-    """
-    xp = namespace(chi2, error)
-    excess = error * xp.sqrt(xp.maximum(1 - 1 / chi2, 0.0))
-    return (chi2 > limit) & (excess > least)
 
 
 def too_late(estimate: Estimate) -> Bool[Array, ""]:

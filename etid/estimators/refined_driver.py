@@ -6,14 +6,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from etid.estimators.judgement import MAX_STEPS_REACHED, misses
+from etid.estimators.judgement import MAX_STEPS_REACHED
 from etid.estimators.lanes import Harmonics
 from etid.estimators.starts import source_starts
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.likelihood import driver, of_calibrations
 from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.linear import inverse
-from etid.likelihood.noise import shows_hum
+from etid.likelihood.noise import misses, shows_hum
 from etid.likelihood.source_prior import delay_std, delay_width
 from etid.precision import array_function, namespace, one_thread
 from etid.recordings.remarks import Remark

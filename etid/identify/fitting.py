@@ -21,7 +21,6 @@ from jaxtyping import Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
-from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import (
     LANES,
     AbstractLane,
@@ -36,6 +35,7 @@ from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.identify import changes
 from etid.identify.second_minimum import ASIDE, likelier
+from etid.likelihood.noise import MISFIT_CHI2
 from etid.precision import one_thread, untraced
 from etid.recordings.causes import LOG, log_changes
 from etid.recordings.preflight import Inspected
@@ -44,7 +44,7 @@ from etid.recordings.repeats import Repeats, repeats
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
 from etid.results.fit import Fit, Support
-from etid.results.verdicts import message, verdicts_of
+from etid.results.verdicts import USABLE, message, verdicts_of
 from etid.selection.evidence import best
 from etid.selection.search import search
 from etid.signals.transfer import AnyArray
@@ -317,15 +317,20 @@ def refitted_loads(
 def may_hum(fit: Fit | Driver) -> Bool[np.ndarray, "*lane"]:
     """Whether a fit shows hum, or misses the recording for any reason."""
     hum = (np.asarray(fit.remarks) & Remark.mains_hum) > 0
-    return np.asarray(hum | ~(np.asarray(fit.chi2) < MISFIT_CHI2))
+    return np.asarray(hum | ~(np.asarray(fit.chi2) < MISFIT_CHI2) | _inexact(fit))
+
+
+def _inexact(found: Fit | Driver) -> Any:
+    return found.inexact if isinstance(found, Fit) else False
 
 
 def better_of(first: _Outcome, second: _Outcome) -> _Outcome:
-    """The second fit if it is successful and shows hum, else the first fit without that remark.
+    """The second fit if hum explains what the first misses, else the first without that remark.
 
     The second fit is the one without the mains harmonics.
     """
-    if second.verdict == "successful" and int(second.remarks) & Remark.mains_hum:
+    explains = second.verdict == "successful" and not _inexact(second)
+    if explains and int(second.remarks) & Remark.mains_hum:
         return second
     return _without_hum(first)
 
@@ -375,7 +380,7 @@ def concluded(
     names, remarked = fits.verdict, fits.remarks | np.asarray(remarks, int)
     coarse = (remarked & Remark.coarse_converter) > 0
     names = np.where(coarse & (names == "insensitive"), "resolution", names)
-    explained = np.isin(names, ("successful", "misfit", "inconsistent", "biased"))
+    explained = np.isin(names, (*USABLE, "misfit", "inconsistent", "biased"))
     names = np.where(change.seen & explained, "changed", names)
     return dataclasses.replace(
         fits,

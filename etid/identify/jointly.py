@@ -13,13 +13,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from tqdm import tqdm
 
 from etid.estimators.element_limits import of_circuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
-from etid.estimators.judgement import STRAINED, misses
+from etid.estimators.judgement import STRAINED
 from etid.estimators.lanes import AbstractLane, Harmonics, Lags, replaced, stacked, taken, unstacked
 from etid.estimators.maximum_likelihood.estimator import (
     NO_OTHER_CIRCUIT,
@@ -27,7 +27,7 @@ from etid.estimators.maximum_likelihood.estimator import (
     description,
 )
 from etid.estimators.maximum_likelihood.rows import estimates, loads_of, source_of
-from etid.estimators.maximum_likelihood.verdict import judged
+from etid.estimators.maximum_likelihood.verdict import ACCEPT, judged
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import check_new, require
 from etid.identify.fitting import (
@@ -55,6 +55,7 @@ from etid.likelihood.fit import Estimate
 from etid.likelihood.joint.fit import Delays, Found, start_of
 from etid.likelihood.joint.fit import fit as fit_together
 from etid.likelihood.joint.loads import Loads
+from etid.likelihood.noise import misses
 from etid.precision import array_function, in_float64, one_thread, untraced
 from etid.recordings.errors import RecordingError
 from etid.recordings.remarks import Remark
@@ -104,6 +105,8 @@ class _Start(NamedTuple):
         falls: Whether a resistance that falls with its current explains most of what it misses.
         changed: Whether the recording shows that the driver has changed since its calibration.
         other: Whether the recording shows another circuit or gain.
+        inexact: Its fit, if its circuit leaves more than the noise: it takes no part, for weights
+            of the noise would trust it too far.
     """
 
     lane: Harmonics
@@ -115,6 +118,7 @@ class _Start(NamedTuple):
     falls: bool
     changed: bool
     other: bool
+    inexact: Fit | None
 
 
 def _narrower(
@@ -188,8 +192,13 @@ class _Group:
             if self.driver.instrument is not None and of is not None:
                 errors = of.at + found.z @ of.by_z
             good = found.settled & np.isfinite(found.chi2) & ~misses(found.chi2, found.rrse)
-            used = good & ~changed & ~found.other & ~(found.strain > STRAINED)
-            signs = used, found.hum, found.falls, changed, found.other
+            used = good & ~changed & ~found.other & ~(found.strain > STRAINED) & ~found.approximate
+            inexact: list[Fit | None] = [None] * len(changed)
+            if found.approximate.any():
+                fits = self._judged(found, changed)
+                for row in np.flatnonzero(found.approximate).tolist():
+                    inexact[row] = taken(fits, row)
+            signs = used, found.hum, found.falls, changed, found.other, inexact
             parts.append(zip(found.logs, found.delays, errors, *signs, strict=True))
         each = itertools.chain.from_iterable(parts)
         return [_Start(lane, *numbers) for lane, numbers in zip(every, each, strict=True)]
@@ -209,8 +218,12 @@ class _Group:
 
     def judged(self, found: Estimate) -> Fit:
         """Fits with their verdicts."""
-        changed = np.zeros(len(self.starts), bool)  # they take no part
-        of = self.driver.result, METHOD, self.prior, self.bounds
+        fits = self._judged(found, np.zeros(len(self.starts), bool))  # these take no part
+        alone = {row: one.inexact for row, one in enumerate(self.starts) if one.inexact is not None}
+        return replaced(fits, list(alone), stacked(list(alone.values()))) if alone else fits
+
+    def _judged(self, found: Estimate, changed: Bool[np.ndarray, " recording"]) -> Fit:
+        of = self.driver.result, METHOD, self.prior, self.bounds, ACCEPT
         return judged(found, self.circuit, changed, *of)
 
     def concluded(self, fits: Fit, driver: HarmonicDriver, narrow: AnyArray) -> Fit:

@@ -316,10 +316,12 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
     cov, shared = (np.diagonal(np.asarray(of)) / values**2 for of in (fit.cov, fit.shared_cov))
     instrument = {name: part for name, part in of.items() if stated[name]}
     rest = shared - sum(part**2 for part in instrument.values())
+    left = np.asarray(effects.discrepancy)
     return Budget(
         names=fit.circuit.names(),
         parts={
-            "recording": np.sqrt(cov - shared),
+            "recording": np.sqrt(np.maximum(cov - shared - left**2, 0.0)),
+            **({"circuit": left} if left.any() else {}),
             "driver": np.sqrt(np.maximum(rest, 0.0)),
             **instrument,
         },

@@ -178,9 +178,11 @@ def _solved(
 def _least_squares(
     basis: Float[AnyArray, "row q"], rest: Float[AnyArray, " row"]
 ) -> tuple[Float[AnyArray, "q row"], Float[AnyArray, " q"], Float[AnyArray, " row"]]:
-    """B⁺, the solution, and what it leaves."""
-    inverse = namespace(basis).linalg.pinv(basis, rtol=EPS * rest.size)
-    q = inverse @ rest
+    """B⁺, the solution, and what it leaves; NaN if a number is not finite."""
+    xp = namespace(basis)
+    finite = xp.isfinite(basis).all() & xp.isfinite(rest).all()
+    inverse = xp.linalg.pinv(xp.where(finite, basis, 0.0), rtol=EPS * rest.size)
+    q = xp.where(finite, inverse @ rest, np.nan)
     return inverse, q, rest - basis @ q
 
 

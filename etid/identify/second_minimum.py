@@ -35,7 +35,7 @@ def likelier(first: Fit, second: Fit) -> Fit:
     moved = np.abs(np.asarray(second.circuit.values()) - np.asarray(first.circuit.values()))
     # Two searches that end in one minimum differ by at most 0.2 standard errors.
     apart = (moved > 2.0 * np.asarray(kept.stderr.values())).any(axis=1)
-    unclear = apart & (np.abs(less) < SEEN**2) & (kept.verdict == "successful")
+    unclear = apart & (np.abs(less) < SEEN**2) & kept.usable
     names = np.where(unclear, "driver_unclear", kept.verdict)
     return dataclasses.replace(kept, result=verdicts_of(names))
 

@@ -149,9 +149,9 @@ def successful(recording: Recording, fit: Fit) -> Fit:
     """The fit.
 
     Raises:
-        IdentificationError: Its verdict is not successful.
+        IdentificationError: Its result cannot be used.
     """
-    if fit.verdict == "successful":
+    if fit.usable:
         return fit
     why = fit.note
     if fit.verdict in EXPLAINED:

@@ -1,19 +1,21 @@
 """The fit of loads behind one driver: elements, standard errors, and what the data contradict."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from etid.circuits.directions import ON_LOADS, SEEN
+from etid.circuits.directions import DIRECTIONS, ON_LOADS, SEEN
 from etid.likelihood import scores
+from etid.likelihood.approximate import approximated, without_delta
 from etid.likelihood.gains import FAULTS
-from etid.likelihood.linear import diagonal, inverse
-from etid.likelihood.noise import excess, shows_hum
+from etid.likelihood.linear import diagonal, inverse, replaced, taken
+from etid.likelihood.noise import excess, is_smooth, misses, shows_hum
 from etid.likelihood.profile import rrse
 from etid.likelihood.scores import Linear, Scores
-from etid.likelihood.search import Load, Minimum, Near, minimum
+from etid.likelihood.search import Load, Minimum, Near, minimum, select
 from etid.likelihood.source import Errors
 from etid.precision import array_function, held, namespace
 from etid.results.fit import Support
@@ -54,6 +56,8 @@ class Estimate(NamedTuple):
             driver.
         support: How well the data support the circuit.
         effects: What errors of the instrument do to the elements.
+        approximate: Whether `cov` contains what the circuit leaves, which the noise does not
+            explain. `chi2` and `rrse` are those of the circuit alone.
         tested: Scores of each of `scored`, and of a falling resistance.
     """
 
@@ -75,6 +79,7 @@ class Estimate(NamedTuple):
     inconsistent: Bool[AnyArray, "*row"]
     support: Support
     effects: Effects
+    approximate: Bool[AnyArray, "*row"]
     tested: Mapping[str, Scores]
 
 
@@ -88,7 +93,43 @@ def fit(
     """
     least = minimum(load, starts, aside)
     logs, delays, z = load.gains.split(least.q)
-    return _estimate(load, least)._replace(logs=logs, delays=delays, z=z)
+    found = _estimate(load, least)._replace(logs=logs, delays=delays, z=z)
+    if namespace(least.q) is not np:
+        return found
+    smooth = is_smooth(least.near.condensed.part, load.gains.exact)
+    if smooth.any():
+        rows = np.flatnonzero(smooth)
+        of = taken(least, rows), starts[0, rows], taken(found, rows)
+        return replaced(found, rows, _approximated(load.of(rows), *of))
+    return found
+
+
+def _approximated(
+    load: Load, least: Minimum, start: Float[np.ndarray, "row q"], exact: Estimate
+) -> Estimate:
+    """The fits with δ, but for those in which something else explains what the circuit leaves."""
+    of = approximated(load, least.near, start)
+    found = _estimate(of.load, of.least)
+    named = [
+        (DIRECTIONS[name].seen(*exact.tested[name][:3]) & of.explains[name]).any(-1)
+        for name in scores.named()
+    ]
+    if load.gains.outputs.count > 1:  # outputs that contradict each other are not averaged
+        named.append(exact.inconsistent)
+    other = np.any(named, 0) | exact.falls | misses(found.chi2, found.rrse) | ~found.settled
+    tested = {
+        name: each._replace(others=without_delta(of.load, each.others))
+        for name, each in found.tested.items()
+    }
+    found = found._replace(
+        tested=tested,
+        chi2=exact.chi2,
+        rrse=exact.rrse,
+        falls=exact.falls,
+        other=other,
+        approximate=~other,
+    )
+    return select(other, exact, found)
 
 
 class _Tested(NamedTuple):
@@ -190,7 +231,12 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
     strain = ((change @ inverse(source.cov)) * change).sum(-1) if change.shape[-1] else 0 * squares
     w = at_knots.w(gains.split(at)[2])
     moved = xp.where(records.used[..., 0, every.index], power(w), 0.0).max(-1)
-    beside = (load.rest(at)[..., :e] ** 2).sum(-1)
+    rest, delta = load.rest(at) ** 2, slice(gains.exact, owned)
+    beside = rest[..., :e].sum(-1) + rest[..., delta].sum(-1)
+    if gains.discrepancy is not None:  # −2 ln of the likelihood without its coefficients
+        by_delta = linear.jacobian[..., delta, :]
+        curved = np.eye(by_delta.shape[-2]) + by_delta @ by_delta.swapaxes(-1, -2)
+        beside = beside + xp.linalg.slogdet(curved)[1]
     possible = xp.isfinite(spreads.z) & xp.isfinite(spreads.stderr)
     support = Support(
         squares + strain + beside - 2 * least.promised,
@@ -215,7 +261,7 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
         z=z,
         cov=own + shared + unknown,
         shared_cov=shared,
-        chi2=squares / (terms - owned - states),
+        chi2=squares / (terms - gains.exact - states),
         rrse=rrse(load.records, profile),
         settled=least.settled,
         points=least.points,
@@ -227,7 +273,11 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
         other=other,
         inconsistent=contradicts,
         support=support,
-        effects=_effects(source.errors, bread, direct, e, owned),
+        effects=dataclasses.replace(
+            _effects(source.errors, bread, direct, e, owned),
+            discrepancy=xp.sqrt((elements[..., delta] ** 2).sum(-1)),
+        ),
+        approximate=xp.zeros(squares.shape, bool),
         tested=each,
     )
 

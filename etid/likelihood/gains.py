@@ -8,6 +8,9 @@ Errors of the instrument that act on loads change them as `DIRECTIONS` says,
 
     V_out / V_th = (1 + g) Z' / (Z' + Z_th) + κ,      Z' = Z_L ‖ C.
 
+What no circuit explains multiplies each output by e^δ, where δ is smooth in frequency
+(`etid.likelihood.discrepancy`); its coefficients are parameters after the delays.
+
 Another kind of data is another class of outputs.
 """
 
@@ -22,6 +25,7 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, impedance_at, with_slopes
 from etid.circuits.directions import DIRECTIONS, ON_LOADS, At, Direction
+from etid.likelihood.discrepancy import Discrepancy
 from etid.likelihood.profile import along_outputs
 from etid.likelihood.source import Source
 from etid.precision import Module, namespace
@@ -102,6 +106,7 @@ class Gains:
         frequency: The frequencies [Hz].
         sample_rate: Sampling rate [Hz].
         outputs: The outputs.
+        discrepancy: δ; None where the model is exact.
     """
 
     source: Source
@@ -109,6 +114,7 @@ class Gains:
     frequency: Float[AnyArray, "*row bin"]
     sample_rate: Float[AnyArray, ""] | float
     outputs: AbstractOutputs = dataclasses.field(default_factory=Voltage)
+    discrepancy: Discrepancy | None = None
 
     @property
     def elements(self) -> int:
@@ -116,23 +122,36 @@ class Gains:
         return len(self.circuit.names())
 
     @property
-    def owned(self) -> int:
-        """Number of own parameters: elements and delays."""
+    def exact(self) -> int:
+        """Number of parameters of an exact model: elements and delays."""
         return self.elements + self.outputs.count
+
+    @property
+    def owned(self) -> int:
+        """Number of own parameters: elements, delays, and coefficients of δ."""
+        return self.exact + (
+            0 if self.discrepancy is None else self.discrepancy.count(self.outputs.count)
+        )
 
     def split(self, q: Float[AnyArray, "*row q"]) -> tuple[AnyArray, ...]:
         """Logarithms of the elements, delays [samples], and z."""
-        own = self.elements, self.owned
-        return q[..., : own[0]], q[..., own[0] : own[1]], q[..., own[1] :]
+        return q[..., : self.elements], q[..., self.elements : self.exact], q[..., self.owned :]
 
     def of(self, rows: np.ndarray) -> "Gains":
         """The gains of some of the rows."""
-        return dataclasses.replace(self, frequency=self.frequency[rows])
+        delta = self.discrepancy and self.discrepancy.rows(rows)
+        return dataclasses.replace(self, frequency=self.frequency[rows], discrepancy=delta)
 
     def at(self, index: np.ndarray) -> "Gains":
         """The same at some of the frequencies."""
         source, frequency = self.source.at(index), self.frequency[..., index]
-        return dataclasses.replace(self, source=source, frequency=frequency)
+        delta = self.discrepancy and self.discrepancy.at(index)
+        return dataclasses.replace(self, source=source, frequency=frequency, discrepancy=delta)
+
+    def _departed(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
+        """e^δ."""
+        assert self.discrepancy is not None
+        return namespace(q).exp(self.discrepancy(q[..., self.exact : self.owned]))
 
     def impedance(self, q: Float[AnyArray, "*row q"]) -> _Numbers:
         """Z_L [Ω]."""
@@ -195,7 +214,8 @@ class Gains:
         values = [value for value, *_ in self.outputs(at, current)]
         for of, size in faults:
             values[0] = values[0] * of.factor(place, size) + of.offset(place, size)
-        return along_outputs(values)
+        gains = along_outputs(values)
+        return gains if self.discrepancy is None else gains * self._departed(q)
 
     def slopes(self, q: Float[AnyArray, "*row q"]) -> Slopes:
         """The gains and their derivatives, at a few frequencies."""
@@ -237,6 +257,13 @@ class Gains:
         if of_faults is not None and self.source.tolerances is not None:
             sizes = self.source.tolerances.faults_by_z[:, :, None, None]
             by_z = by_z + (sizes * of_faults[..., None, :, :, :]).sum(-3)
-        own = by_element[..., None, :] * by_at[..., None, :, :]
-        by_q = xp.concatenate([own, by_delay, by_z], -3)
+        own = [by_element[..., None, :] * by_at[..., None, :, :], by_delay]
+        if self.discrepancy is not None:
+            by = self._departed(q)
+            values, by_at, by_source = values * by, by_at * by, by_source * by
+            own = [of * by[..., None, :, :] for of in own]
+            of = self.discrepancy.by_coefficient(self.outputs.count)
+            own += [values[..., None, :, :] * of]
+            by_z = by_z * by[..., None, :, :]
+        by_q = xp.concatenate([*own, by_z], -3)
         return Slopes(z_load, values, by_at, by_source, by_q)

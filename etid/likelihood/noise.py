@@ -11,6 +11,13 @@ from etid.signals.harmonics import local_sum
 from etid.signals.mains import lines
 from etid.signals.transfer import AnyArray
 
+MISFIT_CHI2 = 1.5  # the record gives the noise to about 5 %, so chi2 is known to 10 %
+MISFIT_RRSE = (
+    1e-3  # of the signal; the best converters and transformers leave this part unexplained
+)
+# χ² of the condensed terms, from which on a residual is smooth. Of good recordings it is 0.7, and
+# at most 1.0 of a thousand at 40 to 72 dB.
+SMOOTH = 1.5
 SURE = 4.0  # standard deviations by which a local variance must exceed the mean
 LOW = 128  # number of first harmonics that are tested for mains hum
 HUM = 14.4  # times the mean; an exponential exceeds it as rarely as a normal number exceeds five σ
@@ -47,3 +54,34 @@ def shows_hum(
     around = xp.where(others, squares, 0.0).sum(-1) / xp.maximum(others.sum(-1), 1)
     loudest = xp.where(suspect, squares, 0.0).max(-1)
     return (loudest > HUM * xp.maximum(around, 1.0)).any(-1)
+
+
+def left(chi2: Float[AnyArray, "*row"], error: Float[AnyArray, "*row"]) -> Float[AnyArray, "*row"]:
+    """What a model leaves beyond the noise, from χ² and RRSE; relative to the signal, too."""
+    xp = namespace(chi2, error)
+    return error * xp.sqrt(xp.maximum(1 - 1 / chi2, 0.0))
+
+
+def misses(
+    chi2: Float[AnyArray, "*row"],
+    error: Float[AnyArray, "*row"],
+    least: float = MISFIT_RRSE,
+    limit: float = MISFIT_CHI2,
+) -> Bool[AnyArray, "*row"]:
+    """Whether the residual exceeds the noise, both in standard deviations and in volts.
+
+    A part `least` of the signal may remain unexplained, and noise explains a χ² of `limit`.
+    """
+    return (chi2 > limit) & (left(chi2, error) > least)
+
+
+def is_smooth(terms: Float[AnyArray, "*row part"], parameters: int) -> Bool[AnyArray, "*row"]:
+    """Whether a residual is smooth in frequency and more than noise.
+
+    Condensed to the knots it keeps its squares, while those of noise become few.
+
+    Args:
+        terms: The condensed terms at the minimum; 0 where nothing is known.
+        parameters: Number of parameters of the fit.
+    """
+    return (terms**2).sum(-1) > SMOOTH * ((terms != 0).sum(-1) - parameters)

@@ -390,7 +390,7 @@ def _search(
 ) -> Minimum:
     xp, at_knots = namespace(starts), load.gains.at(load.knots.index)
     place = np.arange(starts.shape[-1])
-    delays = (place >= load.gains.elements) & (place < load.gains.owned)
+    delays = (place >= load.gains.elements) & (place < load.gains.exact)
 
     def step(load: Load, at_knots: Gains, state: _State) -> _State:
         near = Near.of(load, at_knots, state.trial)

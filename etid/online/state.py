@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 from etid.circuits.display import rounded, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import Description
-from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE
 from etid.estimators.registry import register_description
 from etid.likelihood.linear import diagonal, inverse
+from etid.likelihood.noise import MISFIT_CHI2, MISFIT_RRSE
 from etid.likelihood.scores import doubt
 from etid.online.alarms import MOVED, SEEN_IN_PULSES, SPREAD, score_of
 from etid.online.noise import Noise, directions

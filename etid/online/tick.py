@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
+from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
 from etid.estimators.starts import circuit_starts
 from etid.estimators.unknowns import LoadUnknowns
+from etid.likelihood.noise import misses
 from etid.online.alarms import Innovation, PulseScores, averaged, driver_change
 from etid.online.gain_bands import Bands
 from etid.online.noise import Noise, cleared, directions

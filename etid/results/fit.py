@@ -238,6 +238,16 @@ class Fit(Judged, HasSource[Circuit]):
     by_tolerance: Effects | None = None
 
     @property
+    def inexact(self) -> Any:
+        """Whether the circuit leaves more than noise; an array for a batch.
+
+        The standard errors then contain it.
+        """
+        of, none = self.by_tolerance, np.zeros(np.shape(self.chi2), bool)
+        found = none if of is None else (np.nan_to_num(np.asarray(of.discrepancy)) > 0).any(-1)
+        return found if found.ndim else bool(found)
+
+    @property
     def stderr(self) -> Circuit:
         """Standard errors of the elements, as a circuit of the same kind."""
         # With `jnp`, six programs would compile.
@@ -400,7 +410,7 @@ class Fit(Judged, HasSource[Circuit]):
 
         Empty if each has a tolerance, moves no element further than ±, or is not known.
         """
-        if self.by_tolerance is None or self.verdict != "successful":
+        if self.by_tolerance is None or not self.usable:
             return ""
         values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
         return largest(self.by_tolerance.unstated, self.circuit.names(), errors / values)
@@ -416,7 +426,7 @@ class Fit(Judged, HasSource[Circuit]):
         own = getattr(self, said.get(self.verdict, ""), "")
         doubtful = self.verdict in ("misfit", "inconsistent", "max_steps_reached")
         doubt = "Is what was told right, and in SI units?" if doubtful and self._told[1] else ""
-        driver = "" if self.driver is None or self.verdict == "successful" else self.driver.why
+        driver = "" if self.driver is None or self.usable else self.driver.why
         text = message(self.verdict, self.method == "impedance")
         return [*filter(None, (self.other_circuit, text, own, doubt, driver))]
 

@@ -138,10 +138,13 @@ class Effects(Module):
             deviation where a tolerance is stated, and by an error of the size in `BUDGETED` where
             it is not. NaN where this is not known.
         stated: The tolerance that is stated [relative, F]; 0 without one.
+        discrepancy: Relative standard deviation of each element by what its circuit leaves; 0 where
+            the noise explains the residual. It is in ±.
     """
 
     moved: Float[Array | np.ndarray, "*lane error element"]
     stated: Float[Array | np.ndarray, "*lane error"]
+    discrepancy: Float[Array | np.ndarray, "*lane element"]
 
     @classmethod
     def of_errors(
@@ -158,17 +161,18 @@ class Effects(Module):
         every = xp.concatenate([xp.abs(moved[..., :count, :]), of_resistors, xp.abs(later)], -2)
         order = [(*ON_LOADS, *OF_RESISTORS, *LATER).index(name) for name in BUDGETED]
         stated = xp.broadcast_to(stated, (*moved.shape[:-2], len(BUDGETED)))
-        return cls(every[..., np.array(order), :], stated)
+        return cls(every[..., np.array(order), :], stated, xp.zeros_like(moved[..., 0, :]))
 
     @classmethod
     def unknown(cls, elements: int, *lane: int) -> "Effects":
         """Those of fits whose estimator does not compute them: NaN."""
-        count = len(BUDGETED)
-        return cls(np.full((*lane, count, elements), np.nan), np.full((*lane, count), np.nan))
+        sizes = (len(BUDGETED), elements), (len(BUDGETED),), (elements,)
+        return cls(*(np.full((*lane, *size), np.nan) for size in sizes))
 
     def of_elements(self, places: Int[Array | np.ndarray, " element"]) -> "Effects":
         """The effects on the elements at these places; for one fit."""
-        return dataclasses.replace(self, moved=self.moved[:, places])
+        moved, discrepancy = self.moved[:, places], self.discrepancy[places]
+        return dataclasses.replace(self, moved=moved, discrepancy=discrepancy)
 
     @property
     def unstated(self) -> dict[str, Float[np.ndarray, " element"]]:
@@ -219,8 +223,8 @@ class Budget(Overviewed):
     Attributes:
         names: The elements.
         parts: Standard deviation that each source adds to each element, by the source: the
-            recording, its driver (noise of the calibrations, and drift), and each stated tolerance
-            of the instrument.
+            recording, what the circuit leaves, its driver (noise of the calibrations, and drift),
+            and each stated tolerance of the instrument.
         tolerances: The stated tolerances [relative, F].
         unstated: Size of the change of each element by an error of the instrument that nobody
             stated, of the size in `BUDGETED`.

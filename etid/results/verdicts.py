@@ -18,7 +18,7 @@ from etid.precision import Module
 
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equinox enumerations extend by inheritance
-    """Outcome of one identification. Only `successful` means that the result can be used.
+    """Outcome of one identification. `USABLE` are those whose result can be used.
 
     Three members come from optimistix and lineax: `successful`, `max_steps_reached` (the iteration
     did not converge) and `nonfinite` (inf or NaN appeared during the fit).
@@ -45,6 +45,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "The model misses the recording by more than its noise. Most likely it is another "
         "circuit, or for a driver a higher order: let etid choose it (auto), and look at the "
         "residual."
+    )
+    approximate = (
+        "The circuit is not exact: it leaves more than the noise, smoothly over the frequencies, "
+        "and no fault with a name explains it. The standard errors contain what it leaves."
     )
     changed = (
         "The load or the driver changed during the record: the pulse periods differ by more than "
@@ -124,6 +128,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
 
 
+USABLE = ("successful", "approximate")
+"""Verdicts of results that can be used: their standard errors hold."""
+
 _NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
 
 
@@ -175,6 +182,12 @@ class Judged(Overviewed, Module):
         """Name of the verdict; an array of names for a batch."""
         value = np.asarray(self.result._value)
         return verdict_names(self.result) if value.ndim else _NAMES[value.item()]
+
+    @property
+    def usable(self) -> Any:
+        """Whether the verdict is one of `USABLE`; an array for a batch."""
+        found = np.isin(self.verdict, USABLE)
+        return found if found.ndim else bool(found)
 
 
 def verdicts_of(names: np.ndarray) -> RESULTS:

@@ -23,10 +23,11 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.results.fit import Fit, Support
+from etid.results.verdicts import USABLE
 
 # That a load changed, or that Z_th is open, is no fault of the circuit. Another one with less
 # evidence would be chosen in its place: untested, for only the chosen one is tested for changes.
-_ADEQUATE = ("successful", "changed", "driver_unclear")
+_ADEQUATE = (*USABLE, "changed", "driver_unclear")
 # The data do not determine all elements: they do not contradict the circuit.
 _UNDETERMINED = ("insensitive", "resolution", "driver_failed")
 # Difference of BIC that is "not worth more than a bare mention" (Kass and Raftery 1995, section

@@ -26,6 +26,7 @@ from etid.estimators.lanes import AbstractLane, Bins, Harmonics, HarmonicsWithCu
 from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import fit_one, fit_rows
+from etid.estimators.maximum_likelihood.verdict import ACCEPT
 from etid.estimators.refined_driver import from_harmonics
 from etid.likelihood.of_calibrations import MISSING_POLE
 from etid.precision import is_traced
@@ -109,12 +110,14 @@ class MaximumLikelihood(AbstractEstimator):
         known_elements: Elements that are known: name, value and standard deviation [SI]; 0 fixes
             one.
         bounds: Bounds of elements: name, lower and upper bound [SI].
+        accept: What a circuit may leave beyond the noise, relative to the signal.
         with_current: Whether the measured current is used together with the driver. The default
             method does so for recordings that have both.
     """
 
     known_elements: Known = ()
     bounds: Limits = ()
+    accept: float = ACCEPT
     with_current: bool = False
     name = "maximum_likelihood"
     lane = Harmonics
@@ -178,7 +181,7 @@ class MaximumLikelihood(AbstractEstimator):
         of = driver, known, circuit, str(self), prior, self.bounds
         if is_traced((lane, driver, known)):
             return fit_one(jax.tree.map(jnp.asarray, lane), *of)
-        return taken(fit_rows([lane], *of)[0], 0)
+        return taken(fit_rows([lane], *of, self.accept)[0], 0)
 
     def fit_rows(
         self,
@@ -190,7 +193,7 @@ class MaximumLikelihood(AbstractEstimator):
         """Fits of several recordings, stacked in parts."""
         prior = ElementPrior.of(self.known_elements, circuit)
         harmonics = [lane for lane in lanes if isinstance(lane, Harmonics)]
-        of = known, circuit, str(self), prior, self.bounds
+        of = known, circuit, str(self), prior, self.bounds, self.accept
         return fit_rows(harmonics, driver, *of)
 
     def describe(self) -> Description:

@@ -158,10 +158,11 @@ def fit_rows(
     known: GivenDriver,
     circuit: AbstractCircuit,
     method: str,
-    prior: ElementPrior | None = None,
-    bounds: Limits = (),
+    prior: ElementPrior | None,
+    bounds: Limits,
+    accept: float,
 ) -> list[Fit]:
     """The fits of recordings of equal length and rates, in chunks that are stacked."""
-    of = driver.result, method, prior, bounds
+    of = driver.result, method, prior, bounds, accept
     every = estimates(lanes, known, circuit, prior)
     return [judged(found, circuit, changed, *of) for found, changed in every]

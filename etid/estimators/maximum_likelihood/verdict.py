@@ -16,12 +16,15 @@ from etid.circuits.circuit import AbstractCircuit, too_steep
 from etid.estimators import judgement
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.element_prior import FIXED, ElementPrior
-from etid.estimators.judgement import STRAINED, SUCCESSFUL, misses, unless
+from etid.estimators.judgement import STRAINED, SUCCESSFUL, unless
 from etid.likelihood.fit import Estimate
 from etid.likelihood.linear import diagonal
+from etid.likelihood.noise import MISFIT_RRSE, left, misses
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Limited
 from etid.results.verdicts import RESULTS, verdicts_of
+
+ACCEPT = 0.02  # of the signal: a circuit that leaves more is the wrong one
 
 
 def judged(
@@ -32,6 +35,7 @@ def judged(
     method: str,
     prior: ElementPrior | None,
     bounds: Limits,
+    accept: float,
 ) -> Fit:
     """The fits with their verdicts.
 
@@ -43,6 +47,7 @@ def judged(
         method: Name of the method.
         prior: What is known of the elements; None if nothing is.
         bounds: Bounds of elements; those of elements that the circuit lacks do not count.
+        accept: What a circuit may leave beyond the noise, relative to the signal.
     """
     count = found.logs.shape[-1]
     told, width = np.ones(count), np.full(count, np.inf)
@@ -64,12 +69,14 @@ def judged(
         values = np.where(sound, inside, values)
     values = np.where(width <= FIXED, told, values)
     late = (np.abs(found.delays) > 1).any(-1)  # the model holds for delays of up to one sample
+    rest = left(found.chi2, found.rrse)
+    missed = np.where(found.approximate, rest > accept, misses(found.chi2, found.rrse))
     verdicts = (
         (~np.isfinite(found.chi2), "unstable"),
         (~np.isfinite(values).all(-1), "nonphysical"),
         (too_steep(circuit, found.logs, found.cov), "nonphysical"),
         (~found.settled, "max_steps_reached"),
-        (misses(found.chi2, found.rrse) | late, "misfit"),
+        (missed | late, "misfit"),
         (found.falls, "misfit"),  # which can pass for a change of the driver
         (found.strain > STRAINED, "inconsistent"),
         (contradicted, "out_of_bounds"),
@@ -83,6 +90,7 @@ def judged(
         (found.inconsistent | changed, "inconsistent"),
         (found.far, "driver_unclear"),
         (found.other, "misfit"),
+        (found.approximate & (rest > MISFIT_RRSE), "approximate"),
     )
     conditions, names = zip(*verdicts, strict=True)
     names = np.select(conditions, names, "successful")
@@ -175,6 +183,7 @@ def _ordered(
     both = rows[..., None], places[:, :, None], places[:, None, :]
     support, effects = found.support, found.effects
     by_error = np.take_along_axis(np.asarray(effects.moved), places[:, None, :], -1)
+    by_rest = np.asarray(effects.discrepancy)[rows, places]
     return found._replace(
         logs=found.logs[rows, places],
         cov=found.cov[both],
@@ -187,5 +196,5 @@ def _ordered(
             support.spread_slope[rows, places],
             support.layer_shows,
         ),
-        effects=type(effects)(by_error, effects.stated),
+        effects=type(effects)(by_error, effects.stated, by_rest),
     )

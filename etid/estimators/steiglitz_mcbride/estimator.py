@@ -14,10 +14,11 @@ from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import CHECKED, NEAR_MINIMUM, AbstractEstimator, Description
-from etid.estimators.judgement import BIASED, MAX_STEPS_REACHED, distance_to_minimum, misses
+from etid.estimators.judgement import BIASED, MAX_STEPS_REACHED, distance_to_minimum
 from etid.estimators.lanes import AlignedSamples, stacked
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.likelihood.linear import NormalEquations
+from etid.likelihood.noise import misses
 from etid.precision import array_function, namespace, one_thread, untraced
 from etid.results.driver import DiscreteDriver, Driver
 from etid.results.fit import Fit

@@ -180,6 +180,7 @@ def _estimated(of: Calibrations, common: Common, one: _Fitted) -> Estimate:
         inconsistent=wrong | ((inconsistent | late) & loads.used),
         support=dataclasses.replace(support, z=scores.relevant(tests)),
         effects=Effects.unknown(e, loads.count),
+        approximate=every == 0,
         tested=tests,
     )
 

@@ -1,0 +1,146 @@
+"""Loads that are no circuit, and channels that are not equal: what are elements and ± worth?
+
+The gain of each loaded record of `benchmarks.perturbed_study.undisturbed` has a smooth random
+relative error δ, a Gaussian process in ln f. The default method is compared with generalised least
+squares that knows the covariance of δ, which nobody does. Coverage is that of 1.96 ±.
+"""
+
+import argparse
+import dataclasses
+import itertools
+
+import numpy as np
+
+import etid
+from benchmarks import perturbed_study as lab
+from benchmarks.runner import WORKERS, Target, each, option, report
+from etid.circuits.circuit import SkinRC
+from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood.rows import loads_of, source_of
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
+from etid.identify.fitting import known_of
+from etid.likelihood.approximate import extended, with_delta
+from etid.likelihood.discrepancy import nodes
+from etid.likelihood.search import minimum
+from etid.likelihood.starts import starts
+from etid.recordings.preflight import Inspected
+from etid.simulation.transformer import Impedance, TransformerDriver
+
+SIZES, LENGTHS = (5e-4, 2e-3, 1e-2, 3e-2), (0.5, 1.0, 2.0, 3.0)
+BAND = 30.0, 1e5  # [Hz] of δ; it is constant beyond
+POINTS = 100  # of δ between its ends
+FIRST = 7000  # number of the first driver
+
+MOST_ERROR = 1.3  # rms error, relative to that of a fit that knows the covariance of δ
+COVERED = 0.90, 0.97  # of 1.96 ±
+
+OPTIONS = (
+    WORKERS,
+    option("--snr-db", default=(40.0, 60.0, 80.0), metavar="DB"),
+    option("--sizes", default=SIZES),
+    option("--lengths", default=LENGTHS),
+    option("--drivers", default=40),
+    option("--parts", default=lab.PARTS, help="spread of the parts of the drivers"),
+)
+
+
+def covariance(x: np.ndarray, size: float, length: float) -> np.ndarray:
+    """That of δ between values of ln f."""
+    return size**2 * np.exp(-0.5 * ((x[:, None] - x) / length) ** 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Inexact:
+    """A load behind a driver whose gain is wrong by e^δ, as an impedance.
+
+    Attributes:
+        load: The load.
+        driver: The driver.
+        x: ln f.
+        delta: δ there.
+    """
+
+    load: Impedance
+    driver: TransformerDriver
+    x: np.ndarray
+    delta: np.ndarray
+
+    def __call__(self, f: np.ndarray) -> np.ndarray:
+        """The impedance that makes this gain."""
+        delta = np.interp(np.log(np.maximum(f, 1e-9)), self.x, self.delta)
+        z, z_th = self.load(f), self.driver.z_th(f)
+        gain = z / (z + z_th) * np.exp(delta)
+        return z_th * gain / (1 - gain)
+
+
+def inexact(study: lab.Study, size: float, length: float) -> lab.Study:
+    """The study with a δ of its own for each loaded record."""
+    rng = np.random.default_rng([study.number, *b"inexact"])
+    x = np.linspace(np.log(BAND[0]), np.log(BAND[1]), POINTS)
+    root = np.linalg.cholesky(covariance(x, size, length) + 1e-10 * size**2 * np.eye(POINTS))
+
+    def change(of: lab.Record) -> lab.Record:
+        real, imaginary = root @ rng.standard_normal((2, POINTS, 1))
+        (load,), delta = of.out.loads, (real + 1j * imaginary)[:, 0]
+        return lab.out(loads=(Inexact(load, of.out.driver, x, delta),))(of)
+
+    return lab.trials(change)(study)
+
+
+def answers(
+    number: int, snr_db: float, size: float, length: float, parts: float
+) -> list[tuple[np.ndarray, ...]]:
+    """Errors and ± of each skin, and errors of a fit that knows the covariance of δ.
+
+    They are those of the logarithms of the elements; ± is NaN if the fit cannot be used.
+    """
+    study = inexact(lab.undisturbed(number, snr_db, parts), size, length)
+    of = study.recordings()
+    driver = etid.identify_driver(list(of.calibrations.recordings()), throw=False)
+    found = []
+    for one in of.loaded.recordings():
+        truth = np.log(study.truths[str(one.path)].low)
+        fit = etid.identify_skin(one, driver, throw=False)
+        values, errors = np.asarray(fit.circuit.values()), np.asarray(fit.stderr.values())
+        own = np.log(values) - truth, errors / values if fit.usable else np.full(3, np.nan)
+        found.append((*own, _knowing(one, driver, fit, size, length) - truth))
+    return found
+
+
+def _knowing(
+    one: etid.Recording, driver: etid.Driver, fit: etid.Fit, size: float, length: float
+) -> np.ndarray:
+    """Logarithms of the elements, by a fit that knows the covariance of δ."""
+    lane = Harmonics.of(Inspected.of(one))
+    known = known_of(lane, driver, False, MAXIMUM_LIKELIHOOD)
+    load = loads_of([lane], source_of(known), SkinRC(), None, None)
+    start = starts(load)[0]
+    start[:, :3] = np.log(np.asarray(fit.circuit.values()))  # its own minimum is near
+    load = with_delta(load, covariance(nodes(load.records.x.shape[-1]), size, length)[None])
+    return minimum(load, extended(load, start)[None]).q[0, :3]
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    asked = []
+    numbers = range(FIRST, FIRST + arguments.drivers)
+    for snr_db, size, length in itertools.product(
+        arguments.snr_db, arguments.sizes, arguments.lengths
+    ):
+        tasks = [(number, snr_db, size, length, arguments.parts) for number in numbers]
+        done = dict(each(answers, tasks, arguments.workers, "driver", "inexact"))
+        for path, rows in zip(lab.LOADS, zip(*done.values(), strict=True), strict=True):
+            error, stderr, best = np.moveaxis(np.array(rows), 1, 0)
+            used = np.isfinite(stderr).all(-1)
+            name = f"{snr_db:g} dB, δ {size:.2%}, length {length:g}, {path}"
+            of = np.sqrt(np.mean(error[used] ** 2, 0) / np.mean(best[used] ** 2, 0))
+            covered = np.mean(np.abs(error[used]) < 1.96 * stderr[used], 0)
+            print(f"{name}: {used.mean():.0%} usable; rms error "
+                  f"{', '.join(f'{one:.2%}' for one in np.sqrt(np.mean(error[used] ** 2, 0)))}; "
+                  f"± {', '.join(f'{one:.2%}' for one in np.median(stderr[used], 0))}; within "
+                  f"{', '.join(f'{one:.2f}' for one in covered)}", flush=True)  # fmt: skip
+            asked += [
+                Target(f"{name}: error relative to that of a fit that knows δ", float(of.max()),
+                       most=MOST_ERROR),
+                Target(f"{name}: within 1.96 ±", float(covered.mean()), *COVERED),
+            ]  # fmt: skip
+    return report(asked)
