@@ -152,6 +152,15 @@ def test_a_joint_fit_leaves_them_alone():
     assert np.all(np.abs(off) < 4 * np.asarray(rows["inexact"].stderr.values()))
 
 
+def test_records_of_a_single_period_are_misfits():
+    """What the error does to the states at their ends is not known."""
+    study = inexact(lab.lasting(3400)(lab.undisturbed(44, 60.0)), 0.003, 1.0)
+    of = study.recordings()
+    driver = etid.identify_driver(list(of.calibrations.recordings()))
+    for one in of.loaded.recordings():
+        assert etid.identify_skin(one, driver, throw=False).verdict == "misfit"
+
+
 def test_a_row_does_not_depend_on_others():
     """One of them is not finite."""
     _, _, driver, records = fits_of("δ0.002 1", 41)
