@@ -289,6 +289,8 @@ DIRECTIONS: Mapping[str, Direction] = {
     ),
     "layer": Direction("impedance", _layer, of_circuit=True),
     "falling": Direction(verdict="misfit", looks=("a resistance that falls with its current",)),
+    "compressed current": Direction(verdict="misfit"),
+    "compressed voltage": Direction(verdict="misfit"),
     "gain": Direction(
         "factor",
         _one,

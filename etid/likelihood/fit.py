@@ -195,6 +195,9 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
     added = scores.falling(near, every)
     each["falling"] = scores.rough(linear, added, near, every, share, noise, e)
     fall = each["falling"].of_changes(0)
+    if source.loaded is None:
+        for name, added in scores.compressed(near, every).items():
+            each[name] = scores.rough(linear, added, near, every, share, noise, e)
 
     squares, terms = 2 * profile.objective, records.terms
     states = 0 if profile.states is None else profile.states.shape[-1]

@@ -259,3 +259,30 @@ def falling(near: Near, knots: Knots) -> Complex[AnyArray, "*row output bin"]:
     added = xp.concatenate([added, rest], -1)
     sensitivity = slopes.by_z * (slopes.z * reciprocal(slopes.gains[..., 0, :]))[..., None, :]
     return added[..., None, :] * knots.between(sensitivity * relaxing[..., None, :])
+
+
+def compressed(near: Near, knots: Knots) -> dict[str, Complex[AnyArray, "*row output bin"]]:
+    """What amplifiers that compress their peaks add to the voltage behind a measured current.
+
+    An amplifier shows v (1 − |v|/U) of a signal v, to first order for 1/U. If it is that of the
+    current, the voltage has Z_L |i| i / U more than it should; if it is its own, |v| v / U less.
+    """
+    xp, profile = namespace(near.q), near.profile
+    gains = knots.between(near.slopes.gains[..., 0, :])
+    v_out = gains * profile.x
+    if profile.made is not None:
+        v_out = v_out + profile.made[..., 0, :]
+    of_current, of_voltage = (_bent(of, xp.abs(of).max(-1)) for of in (profile.x, v_out))
+    each = {"compressed current": gains * of_current, "compressed voltage": -of_voltage}
+    return {name: added[..., None, :] for name, added in each.items()}
+
+
+def _bent(
+    v: Complex[AnyArray, "*row bin"], unit: Float[AnyArray, "*row"]
+) -> Complex[AnyArray, "*row bin"]:
+    """|v| v of a signal at all harmonics, by this unit; it differs from v at the edges of pulses."""
+    xp, count = namespace(v), v.shape[-1]
+    whole = xp.concatenate([xp.zeros_like(v[..., :1]), v], -1) / as_complex(unit)[..., None]
+    points = xp.fft.irfft(whole, 2 * FINE * count, norm="forward")
+    bent = xp.fft.rfft(xp.abs(points) * points, norm="forward")[..., 1 : count + 1]
+    return bent * as_complex(unit)[..., None]
