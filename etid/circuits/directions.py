@@ -45,7 +45,13 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.precision import namespace
-from etid.signals.transfer import AnyArray, frequency_variable, from_parts, reciprocal
+from etid.signals.transfer import (
+    AnyArray,
+    as_complex,
+    frequency_variable,
+    from_parts,
+    reciprocal,
+)
 
 FALSE_ALARMS = 1e-4  # probability that chance exceeds the limit of one test
 SEEN = -statistics.NormalDist().inv_cdf(FALSE_ALARMS / 2)  # of a normal number
@@ -258,6 +264,11 @@ def _layer(at: At) -> _Numbers:
     return sum(share * (at.impedance(at.frequency * n**-2.0) - at.z) for share, n in each)
 
 
+def _slow(at: At) -> _Numbers:
+    """What a pole at the end of the band takes away."""
+    return at.s * reciprocal(at.s + as_complex(2 * np.pi * at.frequency[..., -1:]))
+
+
 _SLOW = "one more slow relaxation, a slow tail after each pulse"
 FAST = (
     "one more fast relaxation at the edges of each pulse, of the load or of the driver (a higher "
@@ -289,8 +300,6 @@ DIRECTIONS: Mapping[str, Direction] = {
     ),
     "layer": Direction("impedance", _layer, of_circuit=True),
     "falling": Direction(verdict="misfit", looks=("a resistance that falls with its current",)),
-    "compressed current": Direction(verdict="misfit"),
-    "compressed voltage": Direction(verdict="misfit"),
     "gain": Direction(
         "factor",
         _one,
@@ -353,6 +362,11 @@ DIRECTIONS: Mapping[str, Direction] = {
         deviation=0.92,
         looks=("an inductance in series with the load",),
     ),
+    # A pole at the end of the band in one channel; what it takes away to first order is a delay.
+    "slow voltage": Direction("factor", _slow, verdict="misfit"),
+    # Behind a measured current, amplifiers that show less of their peaks.
+    "compressed current": Direction(verdict="misfit"),
+    "compressed voltage": Direction(verdict="misfit"),
 }
 
 ON_LOADS = tuple(name for name, of in DIRECTIONS.items() if of.records in ("all", "loads"))

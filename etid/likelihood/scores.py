@@ -280,7 +280,7 @@ def compressed(near: Near, knots: Knots) -> dict[str, Complex[AnyArray, "*row ou
 def _bent(
     v: Complex[AnyArray, "*row bin"], unit: Float[AnyArray, "*row"]
 ) -> Complex[AnyArray, "*row bin"]:
-    """|v| v of a signal at all harmonics, by this unit; it differs from v at the edges of pulses."""
+    """|v| v of a signal, by this unit; of pulses, it differs from v at their edges."""
     xp, count = namespace(v), v.shape[-1]
     whole = xp.concatenate([xp.zeros_like(v[..., :1]), v], -1) / as_complex(unit)[..., None]
     points = xp.fft.irfft(whole, 2 * FINE * count, norm="forward")
