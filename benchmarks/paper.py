@@ -111,7 +111,7 @@ def table_4(groups: Groups, truth: Truth) -> list[Row]:
             row["stderr"] = _mean(_stderr_of_mean(fits, truth, i) for fits in some)
             row["rrse"] = 100 * float(np.median([np.median(fits.rrse) for fits in every]))
             counts = {
-                "successful": sum(len(fits.successful()) for fits in every),
+                "successful": sum(len(fits.usable()) for fits in every),
                 "circuits": sum(len(_with_circuit(fits)) for fits in every),
                 "fits": sum(map(len, every)),
             }

@@ -188,7 +188,7 @@ def _use_fits(path: pathlib.Path, seed: int) -> None:
     def read() -> None:
         fits = etid.Fits.read(path)
         "".join(map(str, (fits, fits[0], fits.table(), fits.summary("subject"))))
-        fits.where(condition="dry").successful()
+        fits.where(condition="dry").usable()
 
     def written() -> None:
         StudyFits.read(path).write(path.with_suffix(".again"))

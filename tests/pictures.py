@@ -146,7 +146,7 @@ def selection(**verdicts: str) -> etid.Selection:
 
 
 def fits() -> Fits:
-    """Two subjects, two conditions, three trials; one of them without success, one far away."""
+    """Two subjects, two conditions, three trials; two unusable, one approximate, one far away."""
     rng = np.random.default_rng(1)
     count = 12
     spread = np.exp(0.1 * rng.normal(size=(3, count)))
@@ -154,7 +154,7 @@ def fits() -> Fits:
     values = np.where(dry, SKIN.values()[:, None], [[6.1e3], [17.4e3], [0.66e-9]]) * spread
     values[:, 4] *= 1e3
     verdicts = np.full(count, "successful", dtype=object)
-    verdicts[[1, 4]] = "misfit", "insensitive"
+    verdicts[[1, 2, 4]] = "misfit", "approximate", "insensitive"
     return fits_of(
         fit(verdicts, etid.SkinRC(*jnp.asarray(values))),
         path=np.array([f"recording/{i:02d}" for i in range(count)]),
@@ -165,7 +165,7 @@ def fits() -> Fits:
 
 
 def display() -> Fits:
-    """Three fits of each of two days at electrodes of a display; the last of each is no success."""
+    """Three fits of each of two days at electrodes of a display; the last of each is unusable."""
     found = fits().take(np.array([0, 2, 1] * 2))
     names = np.array(["E1", "E8", "E98", "E1", "E9", "E98"], object)
     days = np.array(["d1"] * 3 + ["d2"] * 3, object)

@@ -176,7 +176,7 @@ def test_failures_are_rows_without_numbers_and_progress_is_shown_only_on_request
     assert all(table["note"][failed])
     assert not any(table["note"][~failed])
     assert mixed.counts() == {"flat": 2, "successful": 2}
-    assert len(mixed.successful()) == 2
+    assert len(mixed.usable()) == 2
     records = [study["s01/dry/0"], study["s01/dry/1"].replace(v_out=np.zeros(LENGTH))]
     for progress, shown in ((False, ""), (True, "2/2")):
         etid.identify_skins(records, driver, progress=progress)
@@ -188,10 +188,10 @@ def test_failures_are_rows_without_numbers_and_progress_is_shown_only_on_request
 
 def test_a_group_without_success_is_counted_and_has_no_median(mixed):
     first, second = mixed.summary("subject")
-    assert (first["subject"], first["fits"], first["successful"]) == ("s01", 3, 2)
-    assert (second["subject"], second["fits"], second["successful"]) == ("s02", 1, 0)
+    assert (first["subject"], first["fits"], first["usable"]) == ("s01", 3, 2)
+    assert (second["subject"], second["fits"], second["usable"]) == ("s02", 1, 0)
     assert np.isnan(second["r_p"])
-    good = mixed.successful()
+    good = mixed.usable()
     np.testing.assert_allclose(first["r_p"], np.mean(np.asarray(good.circuit.r_p)))
     np.testing.assert_allclose(first["r_p_spread"], np.std(np.asarray(good.circuit.r_p), ddof=1))
     np.testing.assert_allclose(first["r_p_stderr"], np.mean(np.asarray(good.stderr.r_p)))
@@ -203,7 +203,7 @@ def test_what_varies_is_the_spread_less_the_noise_of_all_recordings(mixed):
     """Two thirds have 1 % of noise, one third has 10 %, which the median does not show."""
     rng, count, varies = np.random.default_rng(3), 6000, 0.05
     noise = np.where(np.arange(count) % 3 < 2, 0.01, 0.1)
-    many = mixed.successful().take(np.zeros(count, int))
+    many = mixed.usable().take(np.zeros(count, int))
     r_p = 1 + varies * rng.standard_normal(count) + noise * rng.standard_normal(count)
     cov, shared = np.zeros((2, count, 3, 3))
     shared[:, 1, 1] = 0.02**2

@@ -163,7 +163,7 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     r_s, error = float(row[3]), float(row[5])
     assert abs(r_s - 33.4) < 5 * error < r_s  # five standard errors: 1 in 10⁶ by chance
     assert any(line.split()[:3] == ["calibration/98k8", "5", "successful"] for line in printed)
-    assert "without success: 2 recordings" in printed
+    assert "unusable: 2 recordings" in printed
     assert any(line.startswith("typical/dry/99: unreadable. ") for line in printed)
     assert any(line.startswith("typical/dry/02: nonfinite_samples. ") for line in printed)
     fits = etid.Fits.read(target)
@@ -185,7 +185,7 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     groups = data["groups"], fits.summary("subject", "condition")
     told, kept = ([group for group in of if group["subject"]] for of in groups)
     assert told == kept
-    failed, _ = data["unsuccessful"]
+    failed, _ = data["unusable"]
     assert (failed["path"], failed["verdict"]) == ("typical/dry/02", "nonfinite_samples")
     assert failed["note"]
 

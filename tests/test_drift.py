@@ -78,7 +78,7 @@ def test_standard_errors_hold_what_the_parts_of_the_driver_drift_by(driver, name
     assert set(fits.counts()) <= {"successful", "inconsistent", "changed"}
     # One recording of a thousand seems to change; three of 200 are as rare as one in a thousand.
     assert fits.counts().get("changed", 0) < 3
-    good = fits.successful()
+    good = fits.usable()
     assert len(good) > 0.9 * DRIVERS
     covered = np.mean(np.abs(off(good, LOADS[name])) < 1.96, axis=0)
     # 95 % of 189 less three standard deviations; R_p was found in 92 to 94 %, the others in more.

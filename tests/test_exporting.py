@@ -165,7 +165,7 @@ def test_a_circuit_of_impedance_py_has_the_identified_values(fits, file, tmp_pat
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        ("recording/04", 'is insensitive, not successful; its circuit is not exported. is "flat"'),
+        ("recording/04", 'is insensitive, not usable; its circuit is not exported. is "flat"'),
         ("path 99", "there is no fit of 'path 99'; the fits are of 'recording/00', "),
         (None, "say which recording; the fits are of 'recording/00', "),
     ],

@@ -144,7 +144,7 @@ def test_skin_of_another_circuit_does_not_move_the_elements_of_the_others(kind):
 
 
 def test_elements_are_within_their_errors_and_spread_by_their_own_part(outcome):
-    fits = outcome.fits.where(condition="dry").successful()
+    fits = outcome.fits.where(condition="dry").usable()
     assert (np.abs(off(fits)) < SIGMAS).all()
     error = np.asarray(fits.circuit.values()) - np.asarray(DRY.values())
     own = np.sqrt(np.diagonal(fits.cov - fits.fit.shared_cov, axis1=1, axis2=2))
@@ -189,7 +189,7 @@ def test_delays_that_do_not_scatter_leave_smaller_errors_and_the_fits_say_so():
     odd = Trial("odd", two_relaxations, condition="odd")
     common = Scene((*many, odd), KNOWN, trigger_jitter_rms=0.0)
     fits = etid.identify_jointly(common.simulate(seed=3)).fits
-    dry = fits.where(condition="dry").successful()
+    dry = fits.where(condition="dry").usable()
     assert len(dry) == len(many)
     assert (np.asarray(dry.fit.remarks) & Remark.small_delays).all()
     assert not (np.asarray(fits.where(path="odd").fit.remarks) & Remark.small_delays).any()

@@ -193,7 +193,7 @@ def test_a_driver_that_is_followed_too_far_is_no_success():
         study = scene.simulate(seed=seed)
         driver = etid.identify_driver(study["c"], throw=False)
         fits = etid.identify_skins(study.loaded, driver)
-        assert (np.abs(off(fits.successful(), DRY)) < SIGMAS).all()
+        assert (np.abs(off(fits.usable(), DRY)) < SIGMAS).all()
         verdicts += fits.verdicts.tolist()
     assert "driver_unclear" in verdicts
     assert "successful" in verdicts

@@ -424,7 +424,7 @@ def test_weak_pulses_do_not_add_up_to_a_wrong_answer(amplitude, count):
             clean = np.repeat(pulses[number % 10], TEN, 0)
             noisy = clean + 10 * (with_noise(clean, 40 * seed + number) - clean)
             state = tracker.update(state, noisy, amplitude)
-        fits = tracker.read(state).successful()
+        fits = tracker.read(state).usable()
         z += list(off(fits, TRUTH[1]))
     # With a fifteenth of the amplitude a pulse may know an element by less than its size.
     assert len(z) > 0.9 * draws * TEN

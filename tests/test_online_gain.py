@@ -248,7 +248,7 @@ def test_weak_pulses_at_40_db_have_the_errors_that_they_state(skin, amplitude):
         noise = 10 * NOISE * rng.standard_normal((20, TEN, clean.shape[-1]))
         pulses = clean[np.arange(20) % len(clean)] + noise
         _, state = verdicts_of_pulses(tracker, pulses, amplitude)
-        z += list(off(tracker.read(state).successful(), TRUTH[lane]))
+        z += list(off(tracker.read(state).usable(), TRUTH[lane]))
     assert len(z) > 0.98 * draws * TEN
     assert np.abs(z).max() < 5  # one of 240 normal numbers in 7 000 such tests
     # The calibration has 60 dB, so that the electrodes err independently. 0.1 % beyond each limit.

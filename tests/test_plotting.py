@@ -18,7 +18,7 @@ from etid.plotting import figure_of
 from etid.plotting.bands import CLEAR, bands
 from etid.plotting.by_frequency import sample_std
 from etid.plotting.pulses import pulse
-from etid.plotting.style import COLOURS, RED, new_figure
+from etid.plotting.style import COLOURS, RED, VIOLET, new_figure
 from etid.recordings.preflight import Inspected
 from tests import pictures
 
@@ -110,7 +110,7 @@ def test_what_did_not_succeed_looks_so(recording, driver):
         (figure_of(pictures.driver("order_too_low")), "order_too_low"),
     ):
         upper, lower = figure.axes[:2]
-        assert f"no success: {verdict}" in title(upper)
+        assert f"unusable: {verdict}" in title(upper)
         assert "nan" not in title(upper)
         assert to_hex(upper._left_title.get_color()) == RED  # pyright: ignore[reportAttributeAccessIssue]
         told = ["no elements, nothing predicted"] if verdict == "too_short" else []
@@ -173,18 +173,19 @@ def test_an_impedance_is_in_kilohms_and_degrees_in_a_band_of_two_standard_errors
     assert not figure_of(pictures.SKIN).axes[0].collections
 
 
-def test_fits_are_by_subject_and_failures_hollow():
+def test_fits_are_by_subject_unusable_ones_hollow_and_approximate_ones_of_a_colour():
     fits = pictures.fits()
     axis = figure_of(fits).axes[0]
     lines = [line for line in axis.lines if y(line).size]
     points = [line for line in lines if line.get_marker() != "_"]
     values = np.asarray(fits.circuit.r_s) / 1e3
-    for hollow in (False, True):
-        drawn = [y(line) for line in points if (line.get_markerfacecolor() == "white") == hollow]
-        expected = values[(fits.verdicts != "successful") == hollow]
-        np.testing.assert_allclose(np.sort(np.concatenate(drawn)), np.sort(expected))
+    inexact = fits.verdicts == "approximate"
+    for face, of in (("white", ~fits.fit.usable), (VIOLET, inexact)):
+        drawn = [y(line) for line in points if line.get_markerfacecolor() == face]
+        np.testing.assert_allclose(np.sort(np.concatenate(drawn)), np.sort(values[of]))
+    assert sum(y(line).size for line in points) == len(fits)
     (medians,) = set(lines) - set(points)
-    groups = [one for one in fits.summary("subject", "condition") if one["successful"] > 2]
+    groups = [one for one in fits.summary("subject", "condition") if one["usable"] > 2]
     np.testing.assert_allclose(y(medians), [one["r_s"] / 1e3 for one in groups])
     (bars,) = axis.containers[-1][2]
     lengths = [np.ptp(segment[:, 1]) for segment in bars.get_segments()]
@@ -264,7 +265,7 @@ def test_a_long_path_is_whole_and_hides_nothing(recording, driver, show):
 def test_a_fit_without_elements_says_so_in_every_panel(recording, driver, show):
     nothing = pictures.SKIN.with_log_values(jnp.full(3, jnp.nan))
     figure = figure_of(pictures.fit("saturated", nothing), recording, driver, show=show)
-    assert "no success: saturated" in title(figure.axes[0])
+    assert "unusable: saturated" in title(figure.axes[0])
     assert [text.get_text() for axis in figure.axes for text in axis.texts] == ["no elements"] * 3
 
 
@@ -284,7 +285,7 @@ def test_fits_outside_the_axis_and_fits_without_elements_are_told_apart():
     of = dataclasses.replace(fits.fit, circuit=etid.SkinRC(*jnp.asarray(values.T)))
     axis = figure_of(dataclasses.replace(fits, fit=of)).axes[0]
     [told] = [one.get_text() for one in axis.texts if "without" in one.get_text()]
-    assert told == "1 without success outside, 1 without elements"
+    assert told == "1 unusable outside, 1 without elements"
 
 
 def test_the_residual_of_a_wrong_circuit_correlates_with_the_unloaded_voltage(recording, driver):

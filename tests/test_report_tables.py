@@ -18,7 +18,7 @@ SIZES = {symbol: 10.0**power for power, symbol in PREFIXES.items()}
 
 @pytest.fixture(scope="module")
 def fits():
-    """Four recordings, one without success, with elements of very different sizes."""
+    """Four recordings, one unusable, with elements of very different sizes."""
     circuit = etid.SkinRC(RESISTANCE, np.full(4, 186e3), CAPACITANCE)
     verdicts = np.array(["successful", "successful", "misfit", "successful"])
     fit = pictures.fit(verdicts, circuit, own=pictures.RELATIVE, shared=0.001)

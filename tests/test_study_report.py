@@ -132,10 +132,10 @@ def test_names_and_notes_of_a_file_are_text_and_nothing_else(page, found):
 
 def test_worst_fits_are_drawn_with_what_was_measured(page):
     text = _Read(page).text
-    assert "loaded/4: misfit (without success). χ² 7.04, R_s 43.4" in text
-    assert f"{PATHS[5]}: flat (without success). No prediction: no circuit was identified." in text
-    assert "loaded/3: successful (largest χ² among the successful)" in text
-    assert "loaded/0: successful (largest standard error among the successful)" in text
+    assert "loaded/4: misfit (unusable). χ² 7.04, R_s 43.4" in text
+    assert f"{PATHS[5]}: flat (unusable). No prediction: no circuit was identified." in text
+    assert "loaded/3: successful (largest χ² among the usable)" in text
+    assert "loaded/0: successful (largest standard error among the usable)" in text
     assert "not found" not in text
     assert "has changed" not in text
 
@@ -236,7 +236,7 @@ def test_spread_of_subjects_and_recordings_and_errors_are_told_apart():
     )  # fmt: skip
     groups = fits.summary("subject", "condition")
     for one in tables.components(fits, groups):
-        assert (one.subjects, one.successful) == (3, 12)
+        assert (one.subjects, one.usable) == (3, 12)
         assert one.median == pytest.approx(TRUE[one.name])
         assert one.parts["between subjects"] == pytest.approx(np.std(factors, ddof=1))
         # The median of four is their mean here, and so is the median of their errors.
@@ -295,13 +295,13 @@ def test_the_worst_are_of_every_verdict_and_of_every_reason():
     assert len(rows) == len(set(rows)) == 10
     # In turn flat, misfit, saturated, the largest χ² of each first: that grows with the row.
     assert rows[:6] == [28, 31, 32, 27, 30, 26]
-    assert rows[6:8] == [19, 18]  # the largest χ² among the successful
+    assert rows[6:8] == [19, 18]  # the largest χ² among the usable
     assert sorted(rows[8:]) == [5, 6]  # the largest standard errors
     assert list(worst(fits_of([1.0], ["successful"]))) == [0]
 
 
 def test_any_labels_and_elements_without_success_are_drawn_without_a_warning(tmp_path):
-    """The font of the pictures lacks some letters, and only successful fits are positive."""
+    """The font of the pictures lacks some letters, and only usable fits are positive."""
     subjects = np.array(["\u88ab\u9a13\u8005", "\u0633", "s" * 1300, "s01"])
     verdicts = ["successful", "successful", "insensitive", "unstable"]
     fits_of([1.0, 1.1, 0.0, -3e4], verdicts, subject=subjects, trial=subjects).write(
@@ -358,7 +358,7 @@ def test_large_studies_are_condensed_and_say_so(tmp_path, monkeypatch):
     page = _Read(tmp_path / "page.html")
     groups = len(fits.summary("subject", "condition"))
     assert f"{tables.ROWS} of {groups} groups are shown" in page.text
-    assert re.search(r"Quality\s+\d+ fits without success", page.text)
+    assert re.search(r"Quality\s+\d+ fits cannot be used", page.text)
     assert f"Of {count // 5} subjects {figures.CROWD} are drawn" in page.text
     assert page.elements.count("tr") < 5 * tables.ROWS + tables.SINGLE
     assert f"{tables.SINGLE} of {count} recordings are shown" in page.text
@@ -393,7 +393,7 @@ def test_the_table_of_few_subjects_is_not_folded(page):
 
 def test_no_success_at_all_and_no_fit_at_all(tmp_path):
     etid.write_report(fits_of([np.nan] * 2, ["flat"] * 2), tmp_path / "page.html")
-    assert "No fit is successful" in _Read(tmp_path / "page.html").text
+    assert "No fit can be used" in _Read(tmp_path / "page.html").text
     with pytest.raises(ValueError, match="no fit to report on"):
         etid.write_report(fits_of(np.ones(0), []), tmp_path / "page.html")
 
@@ -416,8 +416,8 @@ def test_one_recording_gives_a_page_about_one_recording(tmp_path):
 def test_one_recording_without_elements_has_no_empty_numbers(tmp_path):
     etid.write_report(fits_of([np.nan], ["saturated"]), tmp_path / "page.html")
     read = _Read(tmp_path / "page.html")
-    assert "One recording, loaded/0, without success: saturated." in read.text
-    assert "The fit is no success: saturated." in read.text
+    assert "One recording, loaded/0, unusable: saturated." in read.text
+    assert "The fit is unusable: saturated." in read.text
     assert "medians" not in read.text
     assert "is ;" not in read.text
     assert "table" not in read.elements

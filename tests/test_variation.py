@@ -132,7 +132,7 @@ def test_an_error_that_all_fits_share_is_none_of_their_variation(fits):
     [
         ("r_q", ("subject",), ValueError, "must be one of r_s, r_p, c_p"),
         ("r_p", ("subjekt",), RecordingError, "did you mean subject"),
-        ("r_p", ("site",), ValueError, "no variation by site in 1 successful fit"),
+        ("r_p", ("site",), ValueError, "no variation by site in 1 usable fit"),
     ],
 )
 def test_refusals_of_a_variation(fits, element, by, error, message):

@@ -17,7 +17,7 @@ def fits(recording: etid.Recording, driver: etid.Driver) -> None:
     void = one.circuit.r, one.stderr.r
     many = etid.identify_skins([recording], driver, circuit=etid.SkinCole())
     assert_type(many[0].circuit, etid.SkinCole)
-    void = many.successful().circuit.alpha
+    void = many.usable().circuit.alpha
     print(void)
     chosen = etid.identify_skin(recording, driver, circuit="auto")
     assert_type(chosen.circuit, etid.AbstractCircuit)

@@ -23,7 +23,7 @@ from etid.recordings.replacing import HDF5, claimed
 from etid.results.driver import Order
 from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
-from etid.results.verdicts import message, own_part
+from etid.results.verdicts import USABLE, message, own_part
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -203,7 +203,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 executor=executor,
                 progress=progress,
             )
-    status = DONE if "successful" in outcome.fits.counts() else WRONG_DATA
+    status = DONE if outcome.fits.fit.usable.any() else WRONG_DATA
     files = {"source": arguments.source, "target": arguments.target}
     return Outcome(_summary(outcome), {**files, **_data(outcome)}, status)
 
@@ -233,14 +233,14 @@ def _executor(arguments: argparse.Namespace) -> Iterator[concurrent.futures.Exec
 
 
 def _summary(outcome: StudyFits) -> str:
-    """Text for people: the fits and drivers, and the recordings without success."""
+    """Text for people: the fits and drivers, and the recordings that cannot be used."""
     fits = outcome.fits
     lines = [str(outcome)]
-    if len(fits) == 1 and "successful" in fits.counts():
+    if len(fits) == 1 and fits.fit.usable.all():
         lines += ["", str(fits[0])]
-    failed = np.flatnonzero(fits.verdicts != "successful")
+    failed = np.flatnonzero(~fits.fit.usable)
     if failed.size:
-        lines += ["", f"without success: {several(failed.size, 'recording')}"]
+        lines += ["", f"unusable: {several(failed.size, 'recording')}"]
     listed = failed[:20]
     for verdict in dict.fromkeys(fits.verdicts[listed].tolist()):
         same = [i for i in listed if fits.verdicts[i] == verdict]
@@ -286,9 +286,9 @@ def _data(outcome: StudyFits) -> dict[str, Any]:
         "drivers": drivers,
         "units": fits.circuit.units(),
         "groups": fits.summary("subject", "condition"),
-        "unsuccessful": [
+        "unusable": [
             {"path": path, "verdict": verdict, "note": note}
             for path, verdict, note in labelled
-            if verdict != "successful"
+            if verdict not in USABLE
         ],
     }

@@ -22,7 +22,7 @@ from etid.likelihood.noise import misses
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit, Support
 from etid.results.instrument import Effects
-from etid.results.verdicts import RESULTS, first_verdict, verdict
+from etid.results.verdicts import RESULTS, first_verdict, usable, verdict
 from etid.signals.transfer import AnyArray
 from etid.solvers.matrices import inverse
 
@@ -92,8 +92,7 @@ def judged(
             # An error of 0 also fails: the element has no effect. So does a value of 0, exp() of a
             # far parameter: files of fits hold positive elements where a fit is successful.
             (~jnp.all((errors > 0) & (errors < 1) & (values > 0)), RESULTS.insensitive),
-            # With `!=`, equinox would compile a program for two known verdicts.
-            (driver_result._value != SUCCESSFUL._value, RESULTS.driver_failed),
+            (~usable(driver_result), RESULTS.driver_failed),
         ),
         steps=estimate.steps,
         method=method,

@@ -200,7 +200,7 @@ def export_circuit(
         circuit: Class of the circuit, as in `Fits.read`.
 
     Raises:
-        ValueError: The source is not a file of fits, the fit does not exist or is not successful,
+        ValueError: The source is not a file of fits, the fit does not exist or cannot be used,
             or the target has another suffix.
     """
     suffix = pathlib.Path(target).suffix.lower()
@@ -215,9 +215,9 @@ def export_circuit(
         raise RecordingError(f"{said}; the fits are of {listed(paths)}", file=os.fspath(source))
     index = paths.index(path.strip("/"))
     fit = fits[index]
-    if fit.verdict != "successful":
+    if not fit.usable:
         raise ValueError(
-            f"{os.fspath(source)}: the fit of {paths[index]!r} is {fit.verdict}, not successful; "
+            f"{os.fspath(source)}: the fit of {paths[index]!r} is {fit.verdict}, not usable; "
             f"its circuit is not exported. {fits.notes[index]}"
         )
     try:

@@ -274,7 +274,7 @@ def driver_judged(
         repeats: The periods of its calibrations.
         z_th: Source impedance at the `bands` of these periods [Ω].
     """
-    if not z_th.size or driver.verdict != "successful":
+    if not z_th.size or not driver.usable:
         return driver
     slopes = z_th / (r_load[:, None] + z_th)  # ∂ ln G/∂ ln R: as if the resistor had changed
     if found(repeats, slopes[:, None, :], np.full((len(repeats), 1), 2e-3)).seen.any():

@@ -71,7 +71,7 @@ def identify_driver(
         instrument: Tolerances of the instrument, as in `etid.Instrument(gain=1e-3)`. They enter the
             standard errors of the skins, as part of `shared_cov`. All but a drift need maximum
             likelihood. If not given, it is that of the calibrations (`Recording.instrument`).
-        throw: Raise an error if the verdict is not successful.
+        throw: Raise an error if the result cannot be used.
 
     Returns:
         The driver, with its verdict.
@@ -80,7 +80,7 @@ def identify_driver(
         ValueError: There is no calibration, a calibration has no `r_load`, one is given twice,
             their lengths, rates or instruments differ, the order is below 2, or the method has no
             likelihood that could choose the order, or nothing that the tolerances could enter.
-        IdentificationError: The verdict is not successful and `throw` is set.
+        IdentificationError: The result cannot be used and `throw` is set.
     """
     options = Options.of(order=order, method=method, plausible=plausible, instrument=instrument)
     single = isinstance(calibrations, Recording)
@@ -154,7 +154,7 @@ def calibrated(records: Sequence[Recording], options: Options, throw: bool) -> D
         if isinstance(driver, ContinuousDriver):
             said += [f"start {int(driver.start)} won", *filter(None, [str(driver.tried)])]
         LOG.info("%s: %s", seen[0].recording.path, "; ".join(said))
-    if throw and driver.verdict != "successful":
+    if throw and not driver.usable:
         raise IdentificationError(f"driver: {driver.verdict}. {driver.note}", driver)
     return driver
 
@@ -195,7 +195,7 @@ def _tried_order(driver: HarmonicDriver) -> TriedOrder:
         unknowns=unknowns,
         terms=terms,
         missing_pole=float(driver.missing_pole),
-        adequate=driver.verdict == "successful",
+        adequate=driver.usable,
     )
 
 
@@ -210,7 +210,7 @@ def _driver(
     late = np.zeros(len(seen))
     if isinstance(driver, ContinuousDriver):
         late = np.asarray(driver.calibration.delay_samples)
-    if driver.verdict != "successful" and 1 < np.max(np.abs(late)) < np.inf:
+    if not driver.usable and 1 < np.max(np.abs(late)) < np.inf:
         for one, delay in zip(seen, late, strict=True):
             one.lag += round(delay)
         driver = _aligned(seen, order, estimator, instrument)

@@ -394,9 +394,10 @@ def concluded(
 
 def notes_of(fits: Fit, feed: AbstractFeed) -> list[str]:
     """The note of each of several fits behind one driver, or by their currents."""
-    more = "changed", "misfit", "out_of_bounds", "inconsistent"  # than the message of the verdict
-    names = enumerate(fits.verdict.tolist())
-    notes = (taken(fits, row).note if name in more else message(name) for row, name in names)
+    names = fits.verdict  # some have more to say than the message of the verdict
+    more = np.isin(names, ("changed", "misfit", "out_of_bounds", "inconsistent")) | fits.inexact
+    each = enumerate(zip(names.tolist(), more.tolist(), strict=True))
+    notes = (taken(fits, row).note if of else message(name) for row, (name, of) in each)
     return [with_driver(note, feed) for note in notes]
 
 

@@ -249,7 +249,7 @@ def _passive_fit(
 
 
 def _remarks(z: Complex[np.ndarray, " frequency"]) -> Remark:
-    """Obvious causes of a fit that is not successful."""
+    """Obvious causes of an unusable fit."""
     if not np.imag(z).any():
         return Remark.no_phase
     return Remark.positive_imaginary if np.median(np.imag(z)) > 0 else Remark(0)
@@ -279,7 +279,7 @@ def identify_impedance(
             matter little.
         fixed: Known values of elements by name [SI], as in `{"alpha_1": 0.9}`. Their standard
             errors are 0.
-        throw: Raise an error if the verdict is not successful.
+        throw: Raise an error if the result cannot be used.
 
     Returns:
         Elements, standard errors and verdict. `fit.plot()` draws the fit and the measured points.
@@ -288,7 +288,7 @@ def identify_impedance(
         ValueError: The shapes of the arrays differ, there are too few impedances for the elements,
             a number is missing, not finite or not positive where it must be, or `fixed` is not of
             this circuit, or leaves no element free.
-        IdentificationError: The verdict is not successful and `throw` is set.
+        IdentificationError: The result cannot be used and `throw` is set.
     """
     if isinstance(circuit, str) and circuit == AUTO:
         raise ValueError(
@@ -305,10 +305,10 @@ def identify_impedance(
     passive = _passive_fit(f_up, z_up, len(free)) if sigma is None else None
     noise = None if sigma is None else sigma[rising]
     fit = _fit(_Spectrum(f_up, z_up, noise, structure, structure.log_values(), free), passive)
-    if fit.verdict != "successful":
+    if not fit.usable:
         fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | int(_remarks(z))))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))
-    if throw and fit.verdict != "successful":
+    if throw and not fit.usable:
         causes = " ".join([fit.note, *texts(int(fit.remarks))])
         raise IdentificationError(f"impedance: {fit.verdict}. {causes}", fit)
     return fit

@@ -66,7 +66,7 @@ from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
-from etid.results.verdicts import verdict, verdicts_of
+from etid.results.verdicts import USABLE, verdict, verdicts_of
 from etid.selection.delays import upper_limit
 from etid.signals.harmonics import same_unloaded
 from etid.signals.transfer import AnyArray
@@ -139,7 +139,7 @@ def _narrower(
         rate: Sampling rate of the calibrations [Hz].
         widest: Width of the prior in these fits [samples].
     """
-    good = np.concatenate([fit.verdict == "successful" for fit in fits])
+    good = np.concatenate([fit.usable for fit in fits])
     if good.sum() < 2 or any(loads.load.gains.sample_rate != rate for loads in groups):
         return None
     late, own, slope = (
@@ -233,8 +233,8 @@ class _Group:
         has changed. `narrow` says where a narrower prior of the delays was used.
         """
         changed, other = np.array([(one.changed, one.other) for one in self.starts]).T
-        names = np.where(other & (fits.verdict == "successful"), "misfit", fits.verdict)
-        names = np.where(changed & np.isin(names, ("successful", "misfit")), "inconsistent", names)
+        names = np.where(other & fits.usable, "misfit", fits.verdict)
+        names = np.where(changed & np.isin(names, (*USABLE, "misfit")), "inconsistent", names)
         fits = dataclasses.replace(fits, result=verdicts_of(names))
         remarks = np.where(narrow, np.array(self.remarks) | Remark.small_delays, self.remarks)
         return concluded(fits, driver, remarks.tolist(), self.repeats)
@@ -383,13 +383,13 @@ def _fit_together(groups: Sequence[_Group]) -> tuple[list[Fit], HarmonicDriver]:
     better = _better_driver(driver, of, found)
     small = [np.zeros(len(group.rows), bool) for group in groups]
     width = _narrower(loads, fits, found.delays, found.cov, float(of.rate), float(of.delay_width))
-    if width is not None and better.verdict == "successful":
+    if width is not None and better.usable:
         of = dataclasses.replace(of, delay_width=np.asarray(width))
         found = fit_together(of, loads, found.common, found.owns, told)
         better = _better_driver(driver, of, found)
         for number, (group, one) in enumerate(zip(groups, found.estimates, strict=True)):
             first, second = fits[number], group.judged(one)
-            where = (first.verdict == "successful") & (second.verdict == "successful")
+            where = first.usable & second.usable
             small[number], fits[number] = where, replaced(first, where, taken(second, where))
     if any(one.changed for one in starts) and not any(one.used for one in starts):
         better = dataclasses.replace(better, result=verdict("inconsistent"))

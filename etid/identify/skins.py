@@ -104,7 +104,7 @@ def identify_skin(
             and the standard errors are its own. The remark `at_bound` says that an element would
             lie outside without its bounds; the verdict `out_of_bounds` that they contradict the
             recording. They take the methods that take known elements.
-        throw: Raise an error if the verdict is not successful.
+        throw: Raise an error if the result cannot be used.
 
     Returns:
         Elements, standard errors and verdict. The fit knows its recording and its driver, so that
@@ -112,7 +112,7 @@ def identify_skin(
 
     Raises:
         ValueError: The method cannot use this driver or this circuit.
-        IdentificationError: The verdict is not successful and `throw` is set.
+        IdentificationError: The result cannot be used and `throw` is set.
     """
     options = Options.of(
         candidates_of(circuit), method=method, fixed=fixed, prior=prior, bounds=bounds
@@ -121,7 +121,7 @@ def identify_skin(
     single = len(options.circuits) == 1
     fit = fits[chosen] if single else Selection.of(fits, chosen, options.circuits).fit
     fit = with_data(fit, recording, driver)
-    return successful(recording, fit) if throw else fit
+    return usable(recording, fit) if throw else fit
 
 
 def candidate_fits(
@@ -145,7 +145,7 @@ def candidate_fits(
     return found[0], found.chosen(0)
 
 
-def successful(recording: Recording, fit: Fit) -> Fit:
+def usable(recording: Recording, fit: Fit) -> Fit:
     """The fit.
 
     Raises:
@@ -283,7 +283,7 @@ def select_circuit(
         fixed: As in `identify_skin`; every candidate must have these elements.
         prior: As in `identify_skin`; every candidate must have these elements.
         bounds: As in `identify_skin`; each candidate is fitted inside the bounds of its elements.
-        throw: Raise an error if the verdict of the chosen circuit is not successful.
+        throw: Raise an error if the fit of the chosen circuit cannot be used.
 
     Returns:
         The chosen fit, and evidence, verdict and elements of each candidate. If several circuits
@@ -294,14 +294,14 @@ def select_circuit(
             them apart.
         ValueError: The method cannot use this driver, or cannot compare circuits, or a known
             element is no element of a candidate.
-        IdentificationError: The verdict is not successful and `throw` is set.
+        IdentificationError: The result cannot be used and `throw` is set.
     """
     circuits = usual_circuits() if candidates is None else checked(candidates)
     options = Options.of(circuits, method=method, fixed=fixed, prior=prior, bounds=bounds)
     fits, chosen = candidate_fits(recording, driver, options)
     selection = Selection.of(fits, chosen, circuits)
     if throw:
-        successful(recording, selection.fit)
+        usable(recording, selection.fit)
     return selection
 
 

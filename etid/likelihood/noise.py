@@ -7,6 +7,7 @@ covariance (Jᵀ C J in place of Jᵀ J, White 1980) therefore uses the variance
 from jaxtyping import Bool, Float
 
 from etid.precision import namespace
+from etid.results.fit import left
 from etid.signals.harmonics import local_sum
 from etid.signals.mains import lines
 from etid.signals.transfer import AnyArray
@@ -54,12 +55,6 @@ def shows_hum(
     around = xp.where(others, squares, 0.0).sum(-1) / xp.maximum(others.sum(-1), 1)
     loudest = xp.where(suspect, squares, 0.0).max(-1)
     return (loudest > HUM * xp.maximum(around, 1.0)).any(-1)
-
-
-def left(chi2: Float[AnyArray, "*row"], error: Float[AnyArray, "*row"]) -> Float[AnyArray, "*row"]:
-    """What a model leaves beyond the noise, from χ² and RRSE; relative to the signal, too."""
-    xp = namespace(chi2, error)
-    return error * xp.sqrt(xp.maximum(1 - 1 / chi2, 0.0))
 
 
 def misses(

@@ -26,7 +26,7 @@ from etid.online.controller import Controller
 from etid.plotting.layout import Layout, like_fingertip
 from etid.precision import untraced
 from etid.recordings.errors import in_one_line, install
-from etid.results.verdicts import verdict_names
+from etid.results.verdicts import USABLE, verdict_names
 
 if TYPE_CHECKING:
     from etid.live.loop import Tick
@@ -225,7 +225,7 @@ class LiveView:
         """The state of each electrode in words."""
         tracker, state = self._controller.tracker, tick.state
         words = [
-            GOOD if verdict == "successful" else f"not identified: {verdict}"
+            GOOD if verdict in USABLE else f"not identified: {verdict}"
             for verdict in verdict_names(state.electrodes.result)
         ]
         if self._controls:

@@ -21,7 +21,7 @@ from etid.identify.arguments import recordings as list_of
 from etid.identify.fitting import known_of, remarks_on
 from etid.identify.options import Interval, Options, plan
 from etid.identify.planning import failed_fit
-from etid.identify.skins import successful
+from etid.identify.skins import usable
 from etid.nonlinear.amplitudes import Amplitudes, currents
 from etid.nonlinear.fit import fit_amplitudes
 from etid.nonlinear.response import Recorded, with_filter
@@ -106,7 +106,7 @@ def identify_amplitudes(
         fixed: As in `identify_skin`.
         prior: As in `identify_skin`; also for a current I_0.
         bounds: As in `identify_skin`; also for a current I_0.
-        throw: Raise an error if the verdict is not successful.
+        throw: Raise an error if the result cannot be used.
 
     Returns:
         Elements, standard errors, verdict, and the remarks on all recordings. χ² and RRSE are those
@@ -119,7 +119,7 @@ def identify_amplitudes(
             depends on its current.
         ValueError: The driver was identified by another method, or the circuit has several
             resistors that depend on their current.
-        IdentificationError: The verdict is not successful and `throw` is set.
+        IdentificationError: The result cannot be used and `throw` is set.
     """
     driver = driver_of(driver)
     load = SkinCurrent() if circuit is None else circuit_of(circuit)
@@ -140,7 +140,7 @@ def identify_amplitudes(
         _, name = plan(options, one, feed)
         if name is not None:
             fit = failed_fit(name, options, METHOD)
-            return successful(one.recording, fit) if throw else fit
+            return usable(one.recording, fit) if throw else fit
     free = set(np.array(load.names())[currents(load)]).difference(of for of, *_ in options.known)
     spans = [float(one.spans[0]) for one in seen]
     if free and max(spans) < 1.1 * min(spans):
@@ -159,4 +159,4 @@ def identify_amplitudes(
     fit = _fit(of_all, feed.result, options.bounds)
     remarks = [fit.remarks, *(remarks_on(one, MAXIMUM_LIKELIHOOD) for one in seen)]
     fit = dataclasses.replace(fit, remarks=np.asarray(np.bitwise_or.reduce(remarks)))
-    return successful(seen[0].recording, fit) if throw else fit
+    return usable(seen[0].recording, fit) if throw else fit

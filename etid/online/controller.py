@@ -59,14 +59,13 @@ from jaxtyping import Array, Bool, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import number, rounded, several
 from etid.circuits.overview import Overview, Overviewed
-from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.arguments import number_of, require
 from etid.online.current import CurrentModel
 from etid.online.state import ElectrodeState, TrackerState
 from etid.online.tracker import Tracker, for_each
 from etid.precision import Kept, in_float64
-from etid.results.verdicts import counts
+from etid.results.verdicts import counts, usable
 from etid.solvers.matrices import inverse_of_few
 
 REASONS = np.array(
@@ -226,10 +225,10 @@ class Controller(Overviewed, Kept):
             raise ValueError("fallback is infinite; give an amplitude")
         if not 0.5 <= number_of("probability", probability) < 1:
             raise ValueError(f"probability is {probability}; give at least 0.5 and less than 1")
-        if tracker.driver_result != SUCCESSFUL:
+        if not usable(tracker.driver_result):
             raise ValueError(
-                "the driver of the tracker was not identified successfully, so that no limit of "
-                "the current would hold; repeat the calibration"
+                "the driver of the tracker cannot be used, so that no limit of the current would "
+                "hold; repeat the calibration"
             )
         model = CurrentModel.of(tracker.model)
         most = float(current_cap) * model.phase
@@ -366,7 +365,7 @@ def _commanded(
         # The inverse of `predicted`, in one step.
         cov = inverse_of_few(lane.information) + change**2 * jnp.eye(lane.information.shape[0])
         now = model.current(circuit, LoadUnknowns.of(lane.own).log_elements, cov)
-        good = ~driver_changed & ~lane.repeated & (lane.result == SUCCESSFUL) & (lane.pulses > 0)
+        good = ~driver_changed & ~lane.repeated & usable(lane.result) & (lane.pulses > 0)
         good = good & (now.charge > 0) & (now.charge_stderr < now.charge)
         most = jnp.stack(
             [

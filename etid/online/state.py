@@ -21,7 +21,7 @@ from etid.online.repeats import Windows
 from etid.precision import Module, array_function
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
-from etid.results.verdicts import RESULTS, counted, verdict_names, verdicts_of
+from etid.results.verdicts import RESULTS, counted, usable, verdict_names, verdicts_of
 
 METHOD = "online"
 OPEN = 0.99  # effective gain above which an electrode touches nothing
@@ -194,7 +194,7 @@ def fits_of(
     later = np.select(
         [
             ~(diagonal(cov) < 1).all(-1),
-            np.full(lanes, verdict_names(driver_result) != "successful"),
+            np.full(lanes, ~usable(driver_result)),
             np.full(lanes, driver_changed),
         ],
         ["insensitive", "driver_failed", "inconsistent"],

@@ -44,7 +44,7 @@ ABOUT = (
     "simulated recordings, whose true elements are known. Quiet records have a signal-to-noise "
     "ratio of 60 dB and no trigger delay. Noisy records have 40 dB and 200 ns; the errors of "
     "the paper's method then have about the published size. The tables include every estimate, "
-    "whatever its verdict; `successful` counts the successful fits."
+    "whatever its verdict; `usable` counts the usable fits."
 )
 
 
@@ -60,7 +60,7 @@ def _span(low: float, high: float) -> str:
 
 
 def _successes(fits: etid.Fits) -> str:
-    return f"{len(fits.successful())}/{len(fits)}"
+    return f"{len(fits.usable())}/{len(fits)}"
 
 
 def table_1(outcomes: Sequence[Outcome]) -> Table:
@@ -108,7 +108,7 @@ def table_fingertips(outcomes: Sequence[Outcome], truth: Truth, condition: str) 
             ))  # fmt: skip
     heads = (
         "records", "method", "element", "typical", "error [%]", "spread [%]", "subjects",
-        "error [%]", "worst [%]", "successful",
+        "error [%]", "worst [%]", "usable",
     )  # fmt: skip
     return Table(heads, tuple(rows))
 
@@ -127,15 +127,15 @@ def table_4(outcomes: Sequence[Outcome], truth: Truth) -> Table:
         quality = _number(100 * float(np.median(built.rrse)))
         rows.append((*outcome.names, *cells, quality, _successes(built)))
     heads = tuple(f"{as_symbol(name)} [%]" for name in ORDER)
-    return Table(("records", "method", *heads, "RRSE [%]", "successful"), tuple(rows))
+    return Table(("records", "method", *heads, "RRSE [%]", "usable"), tuple(rows))
 
 
 def table_verdicts(outcomes: Sequence[Outcome], truth: Truth) -> Table:
-    """Verdicts, and the percentage of successful fits whose error is within two standard errors."""
+    """Verdicts, and the percentage of usable fits whose error is within two standard errors."""
     rows = []
     for outcome in outcomes:
         verdicts = ", ".join(f"{count} {name}" for name, count in outcome.skins.counts().items())
-        good = outcome.skins.successful()
+        good = outcome.skins.usable()
         cells = [*outcome.names, outcome.driver.verdict, verdicts]
         for name in ORDER:
             known = np.array([truth[str(path)][name] for path in good.labels["path"]])
@@ -212,7 +212,7 @@ def sections(outcomes: Sequence[Outcome], truth: Truth) -> list[Section]:
         ),
         Section(
             "Verdicts",
-            "The last three columns: percentage of the successful fits whose error is at most two "
+            "The last three columns: percentage of the usable fits whose error is at most two "
             "standard errors (se). All fits of a study share the error of the driver, so their "
             "errors are correlated.",
             (table_verdicts(outcomes, truth),),

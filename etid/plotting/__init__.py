@@ -81,7 +81,7 @@ def plot(
     of the points lie in the band if only this noise is left. The legend says which noise it is.
 
     The bands around impedances are two standard errors, from the covariance of the fit or driver.
-    Fits and drivers without success have a red title, and their points are hollow.
+    Unusable fits and drivers have a red title, and their points are hollow.
 
     The points of `show="impedance"` are what the recording measures in bands of frequency, with two
     standard errors. `show="residual"` adds the autocorrelation of the residual and its
@@ -102,7 +102,7 @@ def plot(
             subject and condition. Medians of three fits or more are thick, with the variation
             between fits beyond their errors.
         map: Element to draw at each electrode of a display, a map for each subject, session, site
-            and condition. An electrode without a successful trial has a mark for its verdict.
+            and condition. An electrode without a usable trial has a mark for its verdict.
         layout: Places of the electrodes, or a file that `etid.read_layout` reads; if not given,
             `E1` to `E98` of the paper's display.
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of

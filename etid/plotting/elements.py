@@ -2,6 +2,7 @@
 
 import statistics
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +16,7 @@ from etid.plotting.style import (
     NARROW,
     ORANGE,
     RED,
+    VIOLET,
     Canvas,
     drawable,
     key,
@@ -35,8 +37,9 @@ LEVEL = 0.95
 
 
 def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
-    """Elements of all fits by two labels, with standard errors; fits without success are hollow.
+    """Elements of all fits by two labels, with standard errors; unusable fits are hollow.
 
+    Approximate fits have a colour of their own.
     A thick bar is the median of a group with the variation between its fits beyond their errors.
 
     Raises:
@@ -60,9 +63,9 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
             if trials.size > 1:
                 x[trials] += width * np.linspace(-0.35, 0.35, trials.size)
     # Fewer fits have no variation.
-    summary = [one for one in fits.summary(*by) if one["successful"] >= 3]
+    summary = [one for one in fits.summary(*by) if one["usable"] >= 3]
     middle = [groups.tolist().index(one[by[0]]) + beside[one[by[1]]] for one in summary]
-    good = fits.verdicts == "successful"
+    good, inexact = fits.fit.usable, fits.verdicts == "approximate"
     room = len(fits) <= 40 and axes[0].figure.get_figwidth() > 5
     beside_points = _distinct(fits, by) if room else ""
     for axis, (name, unit) in zip(axes, units.items(), strict=True):
@@ -73,7 +76,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
         known = drawable(values)
         for i, label in enumerate(series):
             colour, mark = nth(COLOURS, i), nth(MARKS, i)
-            for of, face in ((good, colour), (~good, "white")):
+            for of, face in ((good & ~inexact, colour), (inexact, VIOLET), (~good, "white")):
                 some = known & (second == label) & of
                 axis.errorbar(
                     x[some], values[some], errors[some], fmt=mark, ms=4, lw=0.8, color=colour,
@@ -91,7 +94,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
             axis.set_ylim(low, high)
             shown = known & (values > low) & (values < high)
         plain_ticks(axis.yaxis)
-        hidden = {"without success outside": known & ~shown, "without elements": ~known}
+        hidden = {"unusable outside": known & ~shown, "without elements": ~known}
         told = [f"{of.sum()} {where}" for where, of in hidden.items() if of.any()]
         sizes = (errors / values)[good & known & (errors > 0)]
         if sizes.size:  # on an axis of decades the bars of small errors are hidden by their points
@@ -115,7 +118,12 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     turned = sum(map(len, names)) > 8 * axes[-1].figure.get_figwidth()
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
     axes[-1].set_xlabel(by[0])
-    _legend(axes, list(map(plain, series)), "" if good.all() else "without success")
+    entries = _series(list(map(plain, series)))
+    if inexact.any():
+        entries.append(key("approximate", "o", VIOLET))
+    if not good.all():
+        entries.append(key("unusable", "o", hollow=True))
+    legend(axes, entries)
     bars = "bars: one standard error"
     if summary:
         bars += "; thick: medians, and the variation between fits beyond their errors"
@@ -139,12 +147,9 @@ def _distinct(fits: Fits, by: Sequence[str]) -> str:
     return best if different(best) > len(set(groups)) else ""
 
 
-def _legend(axes: np.ndarray, series: Sequence[str], hollow: str) -> None:
-    """A legend with one entry per series, and one entry that explains hollow points."""
-    entries = [key(name, nth(MARKS, i), nth(COLOURS, i)) for i, name in enumerate(series) if name]
-    if hollow:
-        entries.append(key(hollow, "o", hollow=True))
-    legend(axes, entries)
+def _series(names: Sequence[str]) -> list[Any]:
+    """An entry of a legend for each series."""
+    return [key(name, nth(MARKS, i), nth(COLOURS, i)) for i, name in enumerate(names) if name]
 
 
 def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
@@ -176,7 +181,8 @@ def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
     axis.set_yticks(range(len(bounds)), [plain(one.path) or "-" for one in bounds])
     axis.set_ylim(len(bounds) - 0.5, -0.5)
     named = [symbol(name, "1") for name in names]
-    _legend(axes, named, "undetermined" if undetermined else "")
+    hollow = [key("undetermined", "o", hollow=True)] if undetermined else []
+    legend(axes, [*_series(named), *hollow])
     titled(axis, lines, good=not undetermined)
     return axes
 

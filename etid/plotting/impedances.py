@@ -39,9 +39,11 @@ def draw_bode(canvas: Canvas, things: Mapping[str, Impedance]) -> np.ndarray:
         known = np.isfinite(errors).all()
         look = {"color": nth(COLOURS, i), "linestyle": nth(DASHES, i), "lw": 1.3}
         if isinstance(thing, Fit | Driver):
-            if thing.verdict != "successful":
-                failed.append(f"{label}: no success: {thing.verdict}")
+            if not thing.usable:
+                failed.append(f"{label}: unusable: {thing.verdict}")
                 look |= {"color": RED, "lw": 0.9}
+            if thing.verdict == "approximate":
+                label = f"{label}, approximate"
             label = label if known else f"{label}, no standard error"
         curve(magnitude, phase, frequency, z, label=typeset(label), **look)
         sizes.append(np.abs(z) / 1e3)

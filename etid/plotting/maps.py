@@ -12,6 +12,7 @@ from etid.plotting.style import (
     INK,
     MARKS,
     NO_BREAK,
+    VIOLET,
     Canvas,
     drawable,
     key,
@@ -23,6 +24,7 @@ from etid.plotting.style import (
     titled,
 )
 from etid.results.fits import Fits
+from etid.results.verdicts import USABLE
 
 COLOURS = "cividis"  # readers with and without red-green blindness see it alike
 BY = ("subject", "session", "site", "condition")  # a map for each combination
@@ -32,8 +34,9 @@ LEAST = 1.5  # [inch] width of a map
 def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.ndarray:
     """An element at each electrode, a map for each subject, session, site and condition.
 
-    The colour is the median of the successful trials of an electrode, on one logarithmic scale for
-    all maps. An electrode without a successful trial has a mark of its own for each verdict.
+    The colour is the median of the usable trials of an electrode, on one logarithmic scale for
+    all maps. An electrode without a usable trial has a mark of its own for each verdict;
+    one with an approximate trial has a ring.
 
     Args:
         canvas: Makes the axes; a narrow figure has fewer maps in a row.
@@ -51,9 +54,9 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     keys = groups_of(fits)
     groups = sorted(set(keys))
     values = np.asarray(getattr(fits.circuit, element)) / DISPLAY[units[element]][0]
-    good = (fits.verdicts == "successful") & drawable(values)
+    good = fits.fit.usable & drawable(values)
     norm = LogNorm(*(_round(values[good]) if good.any() else (1.0, 10.0)))
-    bad = sorted({str(verdict) for verdict in fits.verdicts[~good]} - {"successful"})
+    bad = sorted({str(verdict) for verdict in fits.verdicts[~good]} - {*USABLE})
     marks = {verdict: nth(MARKS[1:], number) for number, verdict in enumerate(bad)}
     columns = min(len(groups), max(1, int(min(canvas.width / LEAST, 6))))
     rows = -(-len(groups) // columns)
@@ -69,7 +72,8 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
         shown = np.unique(place[of & good])
         failed = np.setdiff1d(place[of], shown)
         medians = np.array([np.median(values[of & good & (place == one)]) for one in shown])
-        _electrodes(axis, layout, shown, medians, norm)
+        inexact = np.isin(shown, place[of & (fits.verdicts == "approximate")])
+        _electrodes(axis, layout, shown, medians, norm, inexact)
         for one in failed:
             verdict = str(fits.verdicts[of & (place == one)][0])
             at, mark = (1e3 * layout.x[one], 1e3 * layout.y[one]), marks.get(verdict, "x")
@@ -84,7 +88,10 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
         axis.tick_params(labelbottom=True)
     for axis in axes[:, 0]:
         axis.set_ylabel("y [mm]")
-    legend(axes, [key(name, mark, hollow=True) for name, mark in marks.items()])
+    entries = [key(name, mark, hollow=True) for name, mark in marks.items()]
+    if (good & (fits.verdicts == "approximate")).any():
+        entries.append(key("approximate", "o", VIOLET, hollow=True))
+    legend(axes, entries)
     figure = axes.flat[0].figure
     colours = ScalarMappable(norm, COLOURS)
     bar = figure.colorbar(colours, ax=axes, shrink=0.6, pad=0.02, panchor=(0.0, 0.5))
@@ -105,9 +112,14 @@ def _round(values: np.ndarray) -> tuple[float, float]:
 
 
 def _electrodes(
-    axis: Axes, layout: Layout, shown: np.ndarray, values: np.ndarray, norm: LogNorm
+    axis: Axes,
+    layout: Layout,
+    shown: np.ndarray,
+    values: np.ndarray,
+    norm: LogNorm,
+    inexact: np.ndarray,
 ) -> None:
-    """Draw the electrodes with a value; all other places are small dots."""
+    """Draw the electrodes with a value, `inexact` ones with a ring; other places are dots."""
     x, y = 1e3 * layout.x, 1e3 * layout.y
     apart = np.hypot(x[:, None] - x, y[:, None] - y)
     pitch = np.min(apart + np.where(apart > 0, 0.0, np.inf), initial=10.0)
@@ -119,6 +131,6 @@ def _electrodes(
     dots = EllipseCollection(
         size, size, [0.0], units="x", cmap=COLOURS, norm=norm, array=values,
         offsets=np.column_stack([x[shown], y[shown]]), offset_transform=axis.transData,
-        zorder=2,
+        edgecolors=[VIOLET if one else "none" for one in inexact], linewidths=1.5, zorder=2,
     )  # fmt: skip
     axis.add_collection(dots)

@@ -37,7 +37,8 @@ EM = 0.55  # mean width of a character, relative to the size of the font
 INK = "#1a1a1a"
 BLUE = "#0b62a4"
 ORANGE = "#e07b00"
-RED = "#c0392b"  # of what has no success, and of nothing else
+RED = "#c0392b"  # of what cannot be used, and of nothing else
+VIOLET = "#8e44ad"  # of what is approximate, and of nothing else
 COLOURS = (BLUE, ORANGE, "#2e7d32", INK)
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*")
@@ -304,8 +305,8 @@ def listed(fit: Fit) -> list[str]:
 
 def judged(axis: Axes, path: str, found: Fit | Driver, *more: str) -> None:
     """Set a title of the path of the recording, the verdict, χ² and RRSE, and more lines."""
-    good = found.verdict == "successful"
-    words = [found.verdict if good else f"no success: {found.verdict}"]
+    good = found.usable
+    words = [found.verdict if good else f"unusable: {found.verdict}"]
     if np.isfinite(chi2 := float(found.chi2)):
         words.append(f"χ² {rounded(chi2, 3)}")
     if np.isfinite(rrse := float(found.rrse)):

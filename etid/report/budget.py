@@ -23,7 +23,7 @@ def budgets(found: StudyFits, study: Study | None) -> list[Section]:
     Fits by another method than maximum likelihood or by several have none, nor joint fits in files.
     """
     errors = relative_stderr(found.fits)
-    errors[np.asarray(found.fits.verdicts) != "successful"] = np.nan
+    errors[~found.fits.fit.usable] = np.nan
     rows = np.argsort(errors)[: np.sum(np.isfinite(errors))]
     if study is None or not rows.size:
         return []

@@ -43,8 +43,8 @@ SERIES = 4  # largest number of conditions in a figure
 
 @mpl.rc_context(PAPER)
 def distributions(fits: Fits) -> bytes:
-    """Distribution functions of the successful fits, for each element and condition."""
-    good, units = fits.successful(), fits.circuit.units()
+    """Distribution functions of the usable fits, for each element and condition."""
+    good, units = fits.usable(), fits.circuit.units()
     figure, axes = new_figure(1, len(units), (2.6 * len(units) + 0.8, 3.0), sharey=True)
     for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
         for series, condition in enumerate(frequent(fits, SERIES)):
@@ -103,7 +103,7 @@ def by_subject(fits: Fits) -> bytes:
     If there are more than `CROWD` subjects, the figure shows `CROWD` of them, evenly spaced in the
     order of their medians.
     """
-    good, units = fits.successful(), fits.circuit.units()
+    good, units = fits.usable(), fits.circuit.units()
     subjects, place = np.unique(good.labels["subject"].astype(str), return_inverse=True)
     named = subjects.size <= 30
     conditions = frequent(fits, SERIES)

@@ -141,13 +141,14 @@ def words(method: str) -> str:
 
 
 def succeeded(fits: Fits) -> str:
-    """A sentence on the number of successful fits."""
-    good = fits.counts().get("successful", 0)
+    """A sentence on the number of usable fits."""
+    good, approximate = int(fits.fit.usable.sum()), fits.counts().get("approximate", 0)
     if len(fits) == 1:
-        return "The fit is successful." if good else f"The fit is no success: {fits.verdicts[0]}."
+        return f"The fit is {'' if good else 'unusable: '}{fits.verdicts[0]}."
     are = "is" if good == 1 else "are"
     share = f"{several(good, 'fit')} ({100 * good / len(fits):.1f} %)"
-    return f"{share} {are} successful; only these enter medians and spreads."
+    inexact = f", {approximate} of them approximate" if approximate else ""
+    return f"{share} {are} usable{inexact}; only these enter medians and spreads."
 
 
 def _table(found: StudyFits, settings: Settings) -> Table:

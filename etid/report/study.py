@@ -113,7 +113,7 @@ def summary(found: StudyFits) -> str:
         kind, method = type(fits.circuit).__name__, words(fits.fit.method)
         text = f"One recording, {path or 'without a path'}, "
         if not listed(fits[0]):
-            return f"{text}without success: {fits.verdicts[0]}."
+            return f"{text}unusable: {fits.verdicts[0]}."
         return f"{text}identified as {kind} by {method}."
     source = pathlib.Path(settings.source).name if settings is not None else ""
     text = f"{several(len(fits), 'recording')}{f' of {source}' if source else ''}"
@@ -148,7 +148,7 @@ def _drivers(found: StudyFits) -> Section:
     )
     count = len(found.drivers) + len(found.failures)
     if count > study_tables.ROWS:
-        text += f" {study_tables.ROWS} of {count} are shown, those without success first."
+        text += f" {study_tables.ROWS} of {count} are shown, unusable ones first."
     most, pictures = 4, ()  # drivers in one diagram
     named = {", ".join(paths): driver for paths, driver in found.drivers.items()}
     shown = dict(sorted(named.items())[:most])
@@ -166,7 +166,7 @@ def _drivers(found: StudyFits) -> Section:
 def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
     found = study_tables.components(fits, groups)
     if not found:
-        return Section("Elements", warning="No fit is successful: there is nothing to average.")
+        return Section("Elements", warning="No fit can be used: there is nothing to average.")
     units = fits.circuit.units()
     text = (
         "How large each element is, how much it varies, and how well one fit knows it. The last "
@@ -193,7 +193,7 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
         shown = f"the {figures.SERIES} most frequent conditions"
     pictures = (
         Picture(
-            f"Part of the successful fits below a value, for {shown} (number of fits).",
+            f"Part of the usable fits below a value, for {shown} (number of fits).",
             figures.distributions(fits),
             f"Distribution functions of {', '.join(map(as_symbol, units))} by condition; quantiles "
             "are in the table.",
@@ -212,15 +212,15 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
 
 
 def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
-    good = fits.successful()
+    good = fits.usable()
     text = (
-        "Medians of the successful fits, to two digits of their standard error. In per cent of the "
+        "Medians of the usable fits, to two digits of their standard error. In per cent of the "
         "median: the variation between the recordings, their own error and their shared error."
     )
     pictures = ()
     if len(good) > 300:
         caption = (
-            "Each subject's median, the middle half of the successful fits (thick) and nine tenths "
+            "Each subject's median, the middle half of the usable fits (thick) and nine tenths "
             "of them (thin)."
         )
         count = len({str(group["subject"]) for group in groups})
@@ -232,7 +232,7 @@ def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
         alt = "Medians and quantiles of each element by subject and condition."
         pictures = (Picture(caption, figures.by_subject(fits), alt, whole=True),)
     elif len(good):
-        caption = "All fits with their standard errors; hollow without success."
+        caption = "All fits with their standard errors; hollow if unusable."
         alt = "Each element of each fit by subject and condition, with standard errors."
         pictures = (Picture(caption, figures.each_fit(fits), alt, whole=True),)
     more, table = _grouped(fits, groups, ("subject", "condition"))
@@ -259,15 +259,15 @@ def _electrodes(fits: Fits, layout: Layout) -> list[Section]:
         return [Section("Electrodes", text + more, (table,))]
     shown, count = figures.mapped(fits)
     text = (
-        "Median of the successful trials of each electrode, on one scale. The table has the same "
+        "Median of the usable trials of each electrode, on one scale. The table has the same "
         "by electrode; subjects are part of what varies in it."
     )
     if count > figures.MAPS:
         text += f" {figures.MAPS} of {count} maps are drawn; etid.plot(fits, map=…) draws others."
     pictures = tuple(
         Picture(
-            f"{as_symbol(name)} at each electrode; an electrode without success has the mark of "
-            "its verdict.",
+            f"{as_symbol(name)} at each electrode; an electrode without a usable fit has the mark "
+            "of its verdict.",
             figures.electrodes(shown, name, layout),
             f"Maps of {as_symbol(name)} by subject, session, site and condition.",
             whole=True,
@@ -287,26 +287,26 @@ def _grouped(
         call = ", ".join(f'"{name}"' for name in by)
         text = (
             f" {study_tables.ROWS} of {len(rows)} groups are shown, those with the largest share "
-            f"of fits without success; etid.Fits.summary({call}) has all."
+            f"of unusable fits; etid.Fits.summary({call}) has all."
         )
     return text, study_tables.groups(rows, by, fits.circuit.units())
 
 
 def _quality(fits: Fits) -> Section:
-    good, failed = fits.successful(), int(np.sum(fits.verdicts != "successful"))
+    good, failed = fits.usable(), int(np.sum(~fits.fit.usable))
     pictures = ()
     if len(good):
         caption = (
-            "Successful fits: χ² per degree of freedom, 1 (dotted) where the residual is noise, "
+            "Usable fits: χ² per degree of freedom, 1 (dotted) where the residual is noise, "
             "and the standard error of the element that is known worst."
         )
         alt = "Histograms of χ² and of the largest relative standard error."
         drawn = figures.quality(np.asarray(good.chi2), relative_stderr(good))
         pictures = (Picture(caption, drawn, alt, whole=True),)
-    text = "All fits are successful."
+    text = "All fits are usable."
     if failed:
         text = (
-            f"{several(failed, 'fit')} without success: the tables of verdicts and recordings say "
+            f"{several(failed, 'fit')} cannot be used: the tables of verdicts and recordings say "
             "why."
         )
     return Section("Quality", text, (), pictures)
@@ -325,10 +325,12 @@ def _single(fits: Fits) -> Section:
             "error from the driver."
         )
         tables = (study_tables.single(fits),)
-    if verdict == "successful":
-        text = f"{text} {fits[0].outside}".strip()  # in a note of `out_of_bounds` it stands already
-    warning = own_part(verdict, str(fits.notes[0]))
-    return Section("Result", text, tables, warning=warning)
+    said = own_part(verdict, str(fits.notes[0]))
+    if not fits[0].usable:
+        return Section("Result", text, tables, warning=said)
+    outside = fits[0].outside  # in a note of `out_of_bounds` it stands already
+    text = " ".join(filter(None, (text, said, outside)))
+    return Section("Result", text, tables)
 
 
 def _recordings(fits: Fits, waveforms: Section) -> Section:
@@ -339,7 +341,7 @@ def _recordings(fits: Fits, waveforms: Section) -> Section:
     text = "Click a heading to sort. A recording with a link has its waveform below."
     if len(fits) > study_tables.SINGLE:
         text += (
-            f" {study_tables.SINGLE} of {len(fits)} recordings are shown: those without success, "
+            f" {study_tables.SINGLE} of {len(fits)} recordings are shown: the unusable ones, "
             "and every few of the others. The file of fits has all."
         )
     return Section("Recordings", text, (study_tables.recordings(fits, links),))

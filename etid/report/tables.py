@@ -67,7 +67,7 @@ def drivers(
         for paths, text in failures.items()
     ]
     frequency = jax.device_put(np.array([1e3]))
-    chosen = sorted(found.items(), key=lambda item: (item[1].verdict == "successful", item[0]))
+    chosen = sorted(found.items(), key=lambda item: (item[1].usable, item[0]))
     for paths, driver in chosen[: max(0, ROWS - len(rows))]:
         # As NumPy's, for JAX compiles each part that is taken of its arrays.
         z, error = map(np.asarray, (driver.response(frequency), driver.response_stderr(frequency)))
@@ -104,11 +104,11 @@ class Components:
     Attributes:
         condition: The condition.
         name: The element.
-        subjects: Number of subjects with a successful fit.
-        successful: Number of successful fits.
-        median: Median of the successful fits [SI].
-        low: 5 % quantile of the successful fits [SI].
-        high: 95 % quantile of the successful fits [SI].
+        subjects: Number of subjects with a usable fit.
+        usable: Number of usable fits.
+        median: Median of the usable fits [SI].
+        low: 5 % quantile of the usable fits [SI].
+        high: 95 % quantile of the usable fits [SI].
         parts: Standard deviation of the medians of the subjects relative to the median, and,
             relative to the median of each subject, variation between the recordings of one subject
             without noise, standard error from the noise of a recording, and that from the driver;
@@ -118,7 +118,7 @@ class Components:
     condition: str
     name: str
     subjects: int
-    successful: int
+    usable: int
     median: float
     low: float
     high: float
@@ -139,10 +139,10 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
         fits: All fits.
         groups: Their `summary("subject", "condition")`.
     """
-    good = fits.successful()
+    good = fits.usable()
     found = []
     for condition in frequent(fits, CONDITIONS):
-        rows = [g for g in groups if g["condition"] == condition and g["successful"]]
+        rows = [g for g in groups if g["condition"] == condition and g["usable"]]
         if not rows:
             continue
         chosen = good.where(condition=condition)
@@ -162,7 +162,7 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
                     condition=condition,
                     name=name,
                     subjects=len(rows),
-                    successful=values.size,
+                    usable=values.size,
                     median=median,
                     low=low,
                     high=high,
@@ -182,13 +182,13 @@ def show_components(found: Sequence[Components], units: Mapping[str, str]) -> Ta
                 one.condition or "all",
                 heading(as_symbol(one.name), units[one.name], one.median),
                 str(one.subjects),
-                str(one.successful),
+                str(one.usable),
                 significant(one.median / scale, 4),
                 between(one.low / scale, one.high / scale, "1"),
                 *(significant(100 * value) for value in one.parts.values()),
             )
         )
-    heads = ("condition", "element", "subjects", "successful", "median", "5 % to 95 %")
+    heads = ("condition", "element", "subjects", "usable", "median", "5 % to 95 %")
     return Table(
         (*heads, "subjects", "recordings", "own", "shared"),
         tuple(rows),
@@ -207,21 +207,21 @@ def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[
     """
     shown = list(rows)
     if len(shown) > ROWS:
-        worst = np.argsort([row["successful"] / row["fits"] for row in shown], kind="stable")
+        worst = np.argsort([row["usable"] / row["fits"] for row in shown], kind="stable")
         shown = [shown[i] for i in sorted(worst[:ROWS])]
     usual = {name: _typical(np.array([row[name] for row in shown], float)) for name in units}
     parts = ("between", "own", "shared")  # keys of `Fits.summary`
     cells = []
     for row in shown:
         line = [str(row[name]) or "-" for name in by]
-        line.append(f"{row['successful']}/{row['fits']}")
+        line.append(f"{row['usable']}/{row['fits']}")
         for name, unit in units.items():
             median = row[name]
             scale = scaled(unit, usual[name])[0]
             line.append(element(median, row[f"{name}_stderr"], scale).partition(" ±")[0])
             line += [significant(100 * row[f"{name}_{part}"] / median) for part in parts]
         cells.append(tuple(line))
-    heads = [*by, "successful"]
+    heads = [*by, "usable"]
     for name, unit in units.items():
         heads += [heading("median", unit, usual[name]), *(f"{part} [%]" for part in parts)]
     over = [(as_symbol(name), 1 + len(parts)) for name in units]
@@ -237,7 +237,7 @@ def _typical(values: np.ndarray) -> float:
 def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
     """One row for each recording: labels, verdict, elements, quality, note; at most `SINGLE`.
 
-    Of more fits it shows those without success, and every few of the others.
+    Of more fits it shows the unusable ones, and every few of the others.
 
     Args:
         fits: All fits.
@@ -245,8 +245,8 @@ def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
     """
     some = fits
     if len(fits) > SINGLE:
-        bad = np.flatnonzero(fits.verdicts != "successful")[:SINGLE]
-        good = np.flatnonzero(fits.verdicts == "successful")
+        bad = np.flatnonzero(~fits.fit.usable)[:SINGLE]
+        good = np.flatnonzero(fits.fit.usable)
         every = np.linspace(0, good.size - 1, SINGLE - bad.size).round().astype(int)
         some = fits.take(np.union1d(bad, good[every]))
     units = some.circuit.units()

@@ -18,6 +18,7 @@ from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits, sha256
+from etid.results.verdicts import USABLE
 
 
 def find(
@@ -111,7 +112,7 @@ def _predicted(
 def waveforms(found: StudyFits, study: Study | None, problem: str) -> Section:
     """Measured and predicted pulses of the worst fits; `problem` is that with the recordings."""
     text = (
-        "First fits without success: for each verdict those with the largest χ². Then successful "
+        "First unusable fits: for each verdict those with the largest χ². Then successful "
         "fits with the largest χ² and with the largest standard error. One pulse of each."
     )
     heading, chosen = "Worst fits", worst(found.fits)
@@ -143,23 +144,23 @@ def relative_stderr(fits: Fits) -> np.ndarray:
 
 
 def worst(fits: Fits) -> dict[int, str]:
-    """Rows of the worst fits, with the reason: 6 without success, 2 of large χ², 2 of large errors.
+    """Rows of the worst fits, with the reason: 6 unusable, 2 of large χ², 2 of large errors.
 
-    The fits without success have different verdicts if possible, frequent verdicts first. One cause
+    The unusable fits have different verdicts if possible, frequent verdicts first. One cause
     with many recordings therefore does not hide another. Among the fits with one verdict, the
     largest χ² comes first.
     """
     names = fits.verdicts
     chi2 = np.where(np.isfinite(fits.chi2), fits.chi2, -np.inf)
-    failing = [_largest(chi2, names == name) for name in fits.counts() if name != "successful"]
+    failing = [_largest(chi2, names == name) for name in fits.counts() if name not in USABLE]
     in_turn = itertools.chain.from_iterable(itertools.zip_longest(*(rows[:6] for rows in failing)))
     failed = [row for row in in_turn if row is not None]
-    taken = dict.fromkeys(failed[:6], "without success")
+    taken = dict.fromkeys(failed[:6], "unusable")
     for size, reason in (
-        (chi2, "largest χ² among the successful"),
-        (relative_stderr(fits), "largest standard error among the successful"),
+        (chi2, "largest χ² among the usable"),
+        (relative_stderr(fits), "largest standard error among the usable"),
     ):
-        rows = _largest(size, (names == "successful") & np.isfinite(size))
+        rows = _largest(size, fits.fit.usable & np.isfinite(size))
         taken |= dict.fromkeys([row for row in rows if row not in taken][:2], reason)
     return taken
 

@@ -222,8 +222,8 @@ class Driver(AbstractFeed):
 
     @property
     def why(self) -> str:
-        """The verdict and its note, for fits behind this driver; empty if it is successful."""
-        return "" if self.verdict == "successful" else f"Its driver: {self.verdict}. {self.note}"
+        """The verdict and its note, for fits behind this driver; empty if it can be used."""
+        return "" if self.usable else f"Its driver: {self.verdict}. {self.note}"
 
     def _numbers(self) -> str:
         """A sentence with the numbers that explain the verdict; empty if there are none."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import Circuit
 from etid.circuits.directions import ALIKE, DIRECTIONS, FAST, SPREAD, Direction, named
-from etid.circuits.display import quality, quantity, rounded, several
+from etid.circuits.display import per_cent, quality, quantity, rounded, several
 from etid.circuits.overview import Overview, element_rows
 from etid.precision import Module, namespace
 from etid.recordings.remarks import texts, words
@@ -51,11 +51,17 @@ def complex_rrse(
     return xp.sqrt(missed / xp.where(used, power(measured), 0.0).sum(-1))
 
 
+def left(chi2: Float[AnyArray, "*row"], error: Float[AnyArray, "*row"]) -> Float[AnyArray, "*row"]:
+    """What a model leaves beyond the noise, from χ² and RRSE; relative to the signal, too."""
+    xp = namespace(chi2, error)
+    return error * xp.sqrt(xp.maximum(1 - 1 / chi2, 0.0))
+
+
 class IdentificationError(RuntimeError):
-    """An identification was not successful.
+    """The result of an identification cannot be used.
 
     Attributes:
-        outcome: The unsuccessful fit or driver; None if there is none.
+        outcome: The unusable fit or driver; None if there is none.
     """
 
     def __init__(self, text: str, outcome: Any) -> None:
@@ -241,11 +247,22 @@ class Fit(Judged, HasSource[Circuit]):
     def inexact(self) -> Any:
         """Whether the circuit leaves more than noise; an array for a batch.
 
-        The standard errors then contain it.
+        The standard errors then contain it. Of fits in a file, only the verdict tells it.
         """
-        of, none = self.by_tolerance, np.zeros(np.shape(self.chi2), bool)
-        found = none if of is None else (np.nan_to_num(np.asarray(of.discrepancy)) > 0).any(-1)
+        of, found = self.by_tolerance, np.asarray(self.verdict == "approximate")
+        if of is not None:
+            found = found | (np.nan_to_num(np.asarray(of.discrepancy)) > 0).any(-1)
         return found if found.ndim else bool(found)
+
+    @property
+    def leaves(self) -> str:
+        """A sentence on what the circuit leaves, if ± contain it; otherwise empty. For one fit."""
+        if not (self.usable and self.inexact):
+            return ""
+        part = float(left(np.asarray(self.chi2), np.asarray(self.rrse)))
+        # Over all harmonics the noise may hide it.
+        size = f"{per_cent(part)} of the signal" if part > 0 else "less than the noise"
+        return f"The circuit leaves {size}; ± contain it."
 
     @property
     def stderr(self) -> Circuit:
@@ -428,7 +445,7 @@ class Fit(Judged, HasSource[Circuit]):
         doubt = "Is what was told right, and in SI units?" if doubtful and self._told[1] else ""
         driver = "" if self.driver is None or self.usable else self.driver.why
         text = message(self.verdict, self.method == "impedance")
-        return [*filter(None, (self.other_circuit, text, own, doubt, driver))]
+        return [*filter(None, (self.other_circuit, text, own, self.leaves, doubt, driver))]
 
     def _rows(self) -> list[tuple[str, str, str]]:
         values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())

@@ -12,13 +12,13 @@ import numpy as np
 
 import etid
 from etid.circuits.circuit import AbstractCircuit, Circuit
-from etid.circuits.display import heading, several
+from etid.circuits.display import heading, per_cent, several
 from etid.circuits.lookup import class_path
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.errors import install
 from etid.recordings.fields import DESCRIBING, Label, check_names, wanted_labels
 from etid.results.data import with_data
-from etid.results.fit import Fit, Support
+from etid.results.fit import Fit, Support, left
 from etid.results.fits_columns import (
     DESCRIBED,
     LABELS,
@@ -87,7 +87,8 @@ class Fits(Overviewed, Generic[Circuit]):
         fit: The fits, batched along one leading axis, as numpy arrays.
         labels: `path`, `subject`, `session`, `site`, `condition`, `electrode` and `trial` of each
             recording, empty where not given, and numbers that describe the recording.
-        notes: A sentence for each fit that is not successful; empty for the others.
+        notes: A sentence for each fit that is not successful, or whose ± contain what its circuit
+            leaves; empty for the others.
     """
 
     fit: Fit[Circuit]
@@ -193,9 +194,9 @@ class Fits(Overviewed, Generic[Circuit]):
             chosen &= self.labels[name] == value
         return self.take(chosen)
 
-    def successful(self) -> "Fits[Circuit]":
-        """The fits whose verdict is `successful`."""
-        return self.take(self.verdicts == "successful")
+    def usable(self) -> "Fits[Circuit]":
+        """The fits that can be used: their verdict is `successful` or `approximate`."""
+        return self.take(self.fit.usable)
 
     def counts(self) -> dict[str, int]:
         """How often each verdict occurs, most frequent first."""
@@ -229,7 +230,7 @@ class Fits(Overviewed, Generic[Circuit]):
         return pandas.DataFrame(self.table(long=long))
 
     def summary(self, *by: str) -> list[dict[str, Any]]:
-        """Counts, and medians of the successful fits, for each group of labels.
+        """Counts, and medians of the usable fits, for each group of labels.
 
         Each element has these keys:
 
@@ -249,7 +250,7 @@ class Fits(Overviewed, Generic[Circuit]):
 
         Returns:
             A row for each group, sorted by the labels. Numbers are in SI units; they are NaN if the
-            group has no successful fit.
+            group has no usable fit.
 
         Raises:
             RecordingError: A label does not exist.
@@ -279,17 +280,26 @@ class Fits(Overviewed, Generic[Circuit]):
                 np.array([group[name + part] for name in units]) for part in ("", "_stderr")
             )
             elements = [text for _, text, _ in element_rows(units, values, errors)]
-            rows.append((where, f"{group['successful']}/{group['fits']}", *elements))
+            rows.append((where, f"{group['usable']}/{group['fits']}", *elements))
         title = f"{several(len(self), 'fit')} of {type(self.circuit).__name__}"
-        medians = "Median of the successful fits ± median standard error of one fit."
+        medians = "Median of the usable fits ± median standard error of one fit."
         names = [f"{name}s" for name in self.pooled("subject", "condition")]
         pooled = [f"Each row pools {' and '.join(names)}."] if names else []
         return Overview(
             f"{title}: {counted(self.verdicts)}" if len(self) else title,
             rows,
-            ("", "successful", *itertools.starmap(heading, units.items())),
-            [medians, *pooled] if "successful" in self.counts() else [],
+            ("", "usable", *itertools.starmap(heading, units.items())),
+            [medians, *pooled, *self._inexact()] if self.fit.usable.any() else [],
         )
+
+    def _inexact(self) -> list[str]:
+        """A sentence on what circuits leave, if ± of some fits contain it."""
+        some = self.take(self.fit.usable & self.fit.inexact)
+        if not len(some):
+            return []
+        most = per_cent(float(left(np.asarray(some.chi2), np.asarray(some.rrse)).max()))
+        of = several(len(some), "fit")
+        return [f"The circuit leaves up to {most} of the signal in {of}; ± contain it."]
 
     def as_table(self) -> tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]:
         """Columns of the file that `write` makes, their units, and its attributes."""
@@ -353,12 +363,12 @@ def _summary(fits: Fits, by: Sequence[str]) -> list[dict[str, Any]]:
     groups = sorted(set(keys))
     number = {key: i for i, key in enumerate(groups)}
     place = np.array([number[key] for key in keys], int)
-    good = fits.successful()
-    place_good = place[fits.verdicts == "successful"]
+    good = fits.usable()
+    place_good = place[fits.fit.usable]
     order = np.argsort(place_good, kind="stable")
     ends = np.searchsorted(place_good[order], np.arange(len(groups) + 1))
     rows: list[dict[str, Any]] = [
-        dict(zip(by, key, strict=True)) | {"fits": int(count), "successful": int(size)}
+        dict(zip(by, key, strict=True)) | {"fits": int(count), "usable": int(size)}
         for key, count, size in zip(
             groups, np.bincount(place, minlength=len(groups)), np.diff(ends), strict=True
         )

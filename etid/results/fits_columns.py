@@ -15,7 +15,7 @@ from etid.recordings.remarks import remarks_of
 from etid.recordings.schema import FITS
 from etid.results.fit import Limited
 from etid.results.hdf5_table import Table, check_same_length
-from etid.results.verdicts import verdicts_of
+from etid.results.verdicts import USABLE, verdicts_of
 
 SCHEMA = FITS
 VERSION = "1.4"
@@ -93,12 +93,12 @@ def columns_of(
     numbers = (*single, "cov", "shared_cov", "change_stderr")
     real = {name: read[name].astype(float) for name in numbers}
     # Steiglitz-McBride may give others negative elements, and an element without effect may be 0.
-    successful = read["verdict"] == "successful"
+    usable = np.isin(read["verdict"], USABLE)
     for name in kind.names():
-        wrong = successful & ~(real[name] > 0.0)
+        wrong = usable & ~(real[name] > 0.0)
         if wrong.any():
             raise RecordingError(
-                f"{real[name][wrong][0]:g} is no value of an element: a successful fit has "
+                f"{real[name][wrong][0]:g} is no value of an element: a usable fit has "
                 "positive ones",
                 file=table.name,
                 field=name,

@@ -158,7 +158,7 @@ class StudyFits(Overviewed):
         failed = dict(self.failures) | {
             paths: f"{driver.verdict}. {driver.note}"
             for paths, driver in self.drivers.items()
-            if driver.verdict != "successful"
+            if not driver.usable
         }
         drivers = Overview(
             f"{several(len(self.drivers) + len(self.failures), 'driver')}, {len(failed)} failed",

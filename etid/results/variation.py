@@ -43,7 +43,7 @@ class Variation(Overviewed):
     Attributes:
         element: Name of the element.
         unit: Its SI unit.
-        fits: Number of successful fits.
+        fits: Number of usable fits.
         mean: Geometric mean [SI].
         stderr: Its standard error [SI], with that of the drivers: how far it is from that of all
             subjects.
@@ -104,7 +104,7 @@ def variation(
     `driver="session"`: else the errors of their drivers count as variation between sessions.
 
     Args:
-        fits: Fits of one condition; those without success are left out.
+        fits: Fits of one condition; unusable ones are left out.
         element: Name of the element.
         by: Labels, each nested in those before it. A label that does not divide the groups of
             those before it further, or that leaves one recording in each group, is no level.
@@ -121,7 +121,7 @@ def variation(
     if element not in units:
         raise ValueError(f"the element is {element!r}, must be one of {', '.join(units)}")
     check_names(dict.fromkeys((*by, *([driver] if driver else []))), LABELS, "label")
-    good = fits.successful()
+    good = fits.usable()
     values = np.asarray(getattr(good.circuit, element))
     place = list(units).index(element)
     shared = np.asarray(good.fit.shared_cov)[:, place, place]
@@ -130,9 +130,7 @@ def variation(
     s, a = (np.sqrt(np.maximum(of, 0.0)) / values for of in (own, shared))
     levels = _levels([good.labels[name].astype(str) for name in by], by, len(values))
     if len(values) < 2 or not levels:
-        raise ValueError(
-            f"no variation by {', '.join(by)} in {several(len(values), 'successful fit')}"
-        )
+        raise ValueError(f"no variation by {', '.join(by)} in {several(len(values), 'usable fit')}")
     names = good.labels[driver].astype(str) if driver else np.zeros(y.size)
     member = (names[:, None] == np.unique(names)).astype(float)
     # One error for a driver: that of each fit grows with its element, and would explain it.

@@ -5,16 +5,19 @@ the cause, then the remedy.
 """
 
 import functools
+import operator
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool
 
 from etid.circuits.overview import Overviewed
 from etid.precision import Module
+from etid.signals.transfer import AnyArray
 
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equinox enumerations extend by inheritance
@@ -47,8 +50,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "residual."
     )
     approximate = (
-        "The circuit is not exact: it leaves more than the noise, smoothly over the frequencies, "
-        "and no fault with a name explains it. The standard errors contain what it leaves."
+        "The circuit is not exact, and no other circuit or fault that has a name explains what it "
+        "leaves beyond the noise. If ± are too large, look at the residual by frequency."
     )
     changed = (
         "The load or the driver changed during the record: the pulse periods differ by more than "
@@ -156,6 +159,15 @@ def verdict_names(result: RESULTS) -> np.ndarray:
     return np.vectorize(_NAMES.__getitem__, otypes=[object])(values).astype(str)
 
 
+def usable(result: RESULTS) -> Bool[AnyArray, "*lane"]:
+    """Whether results can be used, while a program is traced, too."""
+    number: Any = result._value  # members compare themselves by programs that compile
+    codes = [int(verdict(one)._value) for one in USABLE]
+    if isinstance(number, jax.core.Tracer):
+        return functools.reduce(operator.or_, [number == one for one in codes])
+    return np.isin(np.asarray(number), codes)
+
+
 def counts(names: np.ndarray) -> dict[str, int]:
     """How often each verdict occurs, most frequent first."""
     found, number = np.unique(names, return_counts=True)
@@ -186,7 +198,7 @@ class Judged(Overviewed, Module):
     @property
     def usable(self) -> Any:
         """Whether the verdict is one of `USABLE`; an array for a batch."""
-        found = np.isin(self.verdict, USABLE)
+        found = np.asarray(usable(self.result))
         return found if found.ndim else bool(found)
 
 

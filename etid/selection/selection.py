@@ -132,6 +132,8 @@ class Selection(Overviewed):
             notes.append(f"not fitted, {PATIENCE:g} s had passed: {', '.join(self.late)}")
         if self.fit.verdict != "successful":
             notes.append(message(self.fit.verdict))
+        if self.fit.leaves:
+            notes.append(self.fit.leaves)
         if self.residual:
             notes.append(self.residual)
         title = f"{self.candidates[0].name} of {several(total, 'candidate')}: {self.fit.verdict}"

@@ -16,13 +16,13 @@ from etid.circuits.circuit import AbstractCircuit, too_steep
 from etid.estimators import judgement
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.element_prior import FIXED, ElementPrior
-from etid.estimators.judgement import STRAINED, SUCCESSFUL, unless
+from etid.estimators.judgement import STRAINED, unless
 from etid.likelihood.fit import Estimate
 from etid.likelihood.linear import diagonal
-from etid.likelihood.noise import MISFIT_RRSE, left, misses
+from etid.likelihood.noise import MISFIT_RRSE, misses
 from etid.recordings.remarks import Remark
-from etid.results.fit import Fit, Limited
-from etid.results.verdicts import RESULTS, verdicts_of
+from etid.results.fit import Fit, Limited, left
+from etid.results.verdicts import RESULTS, usable, verdicts_of
 
 ACCEPT = 0.02  # of the signal: a circuit that leaves more is the wrong one
 
@@ -84,7 +84,7 @@ def judged(
         # parameter: files of fits hold positive elements where a fit is successful.
         (~((errors > 0) & (errors < 1) & (values > 0)).all(-1), "insensitive"),
         (
-            np.full(len(values), np.asarray(driver._value) != np.asarray(SUCCESSFUL._value)),
+            np.full(len(values), ~usable(driver)),
             "driver_failed",
         ),
         (found.inconsistent | changed, "inconsistent"),
