@@ -8,6 +8,8 @@ import pytest
 
 import etid
 from etid import cli
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.identify.options import Options
 from etid.results.study_fits import StudyFits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -18,11 +20,13 @@ KNOWN: dict[str, Any] = {
     "fixed": {"r_0": 33.4},
     "prior": {"c_1": (0.12e-6, 0.02e-6)},
     "bounds": {"r_1": (100.0, None)},
+    "accept": 0.01,
 }
 OF_STUDY: dict[str, Any] = {"order": 4, "circuit": STRING, "plausible": (0.0, np.inf), **KNOWN}
 ON_COMMAND_LINE = (
     *("--order", "4", "--circuit", STRING, "--plausible", "0:inf"),
     *("--fix", "r_0=33.4", "--prior", "c_1=1.2e-7,2e-8", "--bound", "r_1=100:"),
+    *("--accept", "0.01"),
 )
 
 
@@ -71,6 +75,7 @@ def test_all_functions_of_skin_take_the_same_options(study):
         assert type(one.circuit) is type(etid.circuit(STRING))
         assert one.circuit.values()[0] == pytest.approx(33.4, rel=1e-6)
         assert one.limits is not None
+        assert "accept=0.01" in one.method
     np.testing.assert_array_equal(many.circuit.values(), fit.circuit.values())
     np.testing.assert_array_equal(chosen.circuit.values(), fit.circuit.values())
 
@@ -114,4 +119,21 @@ def test_a_tolerance_that_no_fit_would_contain_is_refused(source, tmp_path, caps
 def test_files_of_fits_store_the_options(fitted):
     settings = stored(fitted)
     assert settings.plausible == (0.0, np.inf)
+    assert settings.accept == 0.01
     assert (settings.fixed, settings.bounds) == (("r_0 33.4",), ("r_1 above 100.0",))
+
+
+@pytest.mark.parametrize("accept", [-0.01, 1.0, np.nan])
+def test_a_part_of_the_signal_is_from_0_to_less_than_1(study, accept):
+    with pytest.raises(ValueError, match=f"accept is {accept:g}; give the part of the signal"):
+        etid.identify_study(study, accept=accept)
+
+
+def test_what_a_circuit_may_leave_is_an_option_of_maximum_likelihood(study):
+    """As a keyword or of the estimator; others accept nothing beyond the noise."""
+    of = MaximumLikelihood(accept=0.3)
+    assert Options.of(method=of).given_to(of).accept == 0.3
+    assert Options.of(method=of, accept=0.1).given_to(of).accept == 0.1
+    assert Options.of().given_to(MaximumLikelihood()) == MaximumLikelihood(accept=0.02)
+    with pytest.raises(ValueError, match="'output_error' accepts nothing beyond the noise"):
+        etid.identify_study(study, accept=0.1, method="output_error")

@@ -429,6 +429,8 @@ CITED = {  # what a reader sees, and the key of the entry that it must have
     "McBride": "steiglitz1965",
     "Söderström, 2007": "soderstrom2007",
     "White, 1980": "white1980",
+    "Kennedy and O'Hagan, 2001": "kennedy2001",
+    "Patterson and Thompson, 1971": "patterson1971",
     "Bell and Cathey, 1993": "bell1993",
     "Willsky and Jones, 1976": "willsky1976",
     "Lowry et al., 1992": "lowry1992",

@@ -74,6 +74,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "[relative], c_load or capacitance [F], delay [s], such as gain=1e-3; may be repeated",
     )
     parser.add_argument(
+        "--accept",
+        type=float,
+        metavar="PART",
+        help="part of the signal that a circuit may leave beyond the noise; default 0.02",
+    )
+    parser.add_argument(
         "--plausible",
         type=_written_as("--plausible", "300:300e3"),
         default=PLAUSIBLE,
@@ -171,6 +177,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         "fixed": _by_name("--fix", arguments.fix),
         "prior": _by_name("--prior", arguments.prior),
         "bounds": _by_name("--bound", arguments.bound),
+        "accept": arguments.accept,
         "plausible": arguments.plausible,
         "instrument": _instrument(arguments.tolerance),
     }

@@ -95,6 +95,8 @@ class Description:
         of_driver: Further conditions that an identified driver meets.
         errors: How the standard errors were computed, as the end of a sentence; empty without
             standard errors.
+        inexact: Sentences on circuits that leave more than noise, and what is accepted of them;
+            empty if nothing is.
         refined: Whether Levenberg-Marquardt found the minima from several starts.
         noise: Sentence that states how the noise of the records was estimated.
         cited: Keys of the references in these texts.
@@ -107,6 +109,7 @@ class Description:
     behind_conditions: tuple[str, ...] = ()
     of_driver: tuple[str, ...] = ()
     errors: str = ""
+    inexact: str = ""
     refined: bool = False
     noise: str = NOISE
     cited: tuple[str, ...] = ()

@@ -237,6 +237,7 @@ def fit_file(
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
+    accept: float | None = None,
     instrument: Instrument | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
     resume: bool = False,
@@ -256,6 +257,7 @@ def fit_file(
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
+        accept: As in `identify_skin`.
         instrument: As in `identify_driver`.
         plausible: As in `identify_driver`.
         resume: Keep the parts of an earlier run that did not finish.
@@ -273,7 +275,7 @@ def fit_file(
             has calibrations of no driver or of several, or another process is writing the target.
         ValueError: The source has no loaded recording.
     """
-    of_fit = FitOptions(method=method, fixed=fixed, prior=prior, bounds=bounds)
+    of_fit = FitOptions(method=method, fixed=fixed, prior=prior, bounds=bounds, accept=accept)
     options = Options.of(
         candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit
     )

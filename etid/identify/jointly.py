@@ -27,7 +27,7 @@ from etid.estimators.maximum_likelihood.estimator import (
     description,
 )
 from etid.estimators.maximum_likelihood.rows import estimates, loads_of, source_of
-from etid.estimators.maximum_likelihood.verdict import ACCEPT, judged
+from etid.estimators.maximum_likelihood.verdict import judged
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import check_new, require
 from etid.identify.fitting import (
@@ -162,7 +162,7 @@ class _Group:
     def __init__(self, options: Options, like: Prepared) -> None:
         self.circuit, self.bounds = options.circuit, of_circuit(options.bounds, options.circuit)
         self.prior = ElementPrior.of(options.known, options.circuit)
-        self.estimator = like.estimator
+        self.estimator, self.accept = like.estimator, options.accept
         self.driver = untraced(serving(like.driver, HarmonicDriver, str(like.estimator)))
         self.known = known_of(like.lane, self.driver, like.shared, MAXIMUM_LIKELIHOOD)
         self.rows: list[int] = []
@@ -223,7 +223,7 @@ class _Group:
         return replaced(fits, list(alone), stacked(list(alone.values()))) if alone else fits
 
     def _judged(self, found: Estimate, changed: Bool[np.ndarray, " recording"]) -> Fit:
-        of = self.driver.result, METHOD, self.prior, self.bounds, ACCEPT
+        of = self.driver.result, METHOD, self.prior, self.bounds, self.accept
         return judged(found, self.circuit, changed, *of)
 
     def concluded(self, fits: Fit, driver: HarmonicDriver, narrow: AnyArray) -> Fit:
@@ -266,6 +266,7 @@ def identify_jointly(
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
+    accept: float | None = None,
     instrument: Instrument | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
     progress: bool = False,
@@ -288,6 +289,8 @@ def identify_jointly(
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
+        accept: As in `identify_skin`. A recording whose circuit leaves more than noise does not
+            influence the driver, and is fitted alone.
         instrument: Tolerances of the instrument, as in `identify_driver`; errors of one driver are
             common to its calibrations and all its recordings. With `etid.Instrument()`, which has
             none, `fit.budget` shows what they would add.
@@ -305,7 +308,7 @@ def identify_jointly(
         RecordingError: Two recordings with a driver have the same samples of `v_out`.
     """
     require("study", study, Study)
-    of_fit = FitOptions(fixed=fixed, prior=prior, bounds=bounds)
+    of_fit = FitOptions(fixed=fixed, prior=prior, bounds=bounds, accept=accept)
     options = Options.of(
         candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit
     )

@@ -17,12 +17,14 @@ from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.maximum_likelihood.verdict import ACCEPT
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, WITH_CURRENT, Method, named
 from etid.identify.arguments import (
     Interval,
     bounds_of,
     circuit_of,
     known_elements,
+    number_of,
     order_of,
     range_of,
     require,
@@ -49,6 +51,7 @@ class FitOptions(TypedDict, total=False):
     fixed: Mapping[str, float] | None
     prior: Mapping[str, tuple[float, float]] | None
     bounds: Mapping[str, Interval] | None
+    accept: float | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +64,7 @@ class Options:
         estimator: The requested estimator; None for the default of each recording.
         known: Elements that are known.
         bounds: Elements with bounds.
+        accept: What a circuit may leave beyond the noise, relative to the signal.
         order: Number of poles of Z_th.
         instrument: As in `identify_driver`.
         plausible: As in `identify_driver`.
@@ -70,6 +74,7 @@ class Options:
     estimator: AbstractEstimator | None = None
     known: Known = ()
     bounds: Limits = ()
+    accept: float = ACCEPT
     order: Order = 5
     instrument: Instrument | None = None
     plausible: tuple[float, float] = PLAUSIBLE
@@ -91,8 +96,8 @@ class Options:
                 or `plausible` is no range.
             ValueError: No estimator has this name, or the estimator cannot identify these circuits,
                 cannot choose between them, or has no use for another option. A known element is no
-                element of a circuit, bounds are impossible, or a relative standard deviation is not
-                in 0 ≤ value < 1.
+                element of a circuit, bounds are impossible, or a relative standard deviation or
+                `accept` is not in 0 ≤ value < 1.
         """
         if instrument is not None:
             require("instrument", instrument, Instrument)
@@ -105,6 +110,7 @@ class Options:
             estimator=estimator,
             known=known_elements(of_fit.get("fixed"), of_fit.get("prior")),
             bounds=bounds_of(of_fit.get("bounds")),
+            accept=_accepted(of_fit.get("accept"), estimator),
             order=order_of(order),
             instrument=instrument,
             plausible=range_of("plausible", plausible),
@@ -122,11 +128,13 @@ class Options:
         return self.circuits[0]
 
     def given_to(self, estimator: AbstractEstimator) -> AbstractEstimator:
-        """The estimator with the known elements and the bounds.
+        """The estimator with the known elements, the bounds, and what a circuit may leave.
 
         Raises:
-            ValueError: It takes none.
+            ValueError: It takes no known elements and no bounds.
         """
+        if isinstance(estimator, MaximumLikelihood) and estimator.accept != self.accept:
+            estimator = dataclasses.replace(estimator, accept=self.accept)
         if not self.known and not self.bounds:
             return estimator
         if not isinstance(estimator, MaximumLikelihood):
@@ -164,6 +172,7 @@ class Options:
                 f"{name} above {low!r}" if high == math.inf else f"{name} {low!r} to {high!r}"
                 for name, low, high in self.bounds
             ),
+            accept=self.accept,
             precision="float64",
             backend=jax.default_backend(),
             versions=versions(),
@@ -183,6 +192,23 @@ class Options:
             checked(self.known, circuit)
         if self.bounds:
             checked_limits(self.bounds, self.known, self.circuits)
+
+
+def _accepted(told: float | None, estimator: AbstractEstimator | None) -> float:
+    """What a circuit may leave: as the caller or the requested estimator says, else `ACCEPT`."""
+    if told is None:
+        return estimator.accept if isinstance(estimator, MaximumLikelihood) else ACCEPT
+    if estimator is not None and not isinstance(estimator, MaximumLikelihood):
+        raise ValueError(
+            f"method {str(estimator)!r} accepts nothing beyond the noise; use the method "
+            "maximum_likelihood, or remove accept"
+        )
+    if not 0 <= (accept := number_of("accept", told)) < 1:
+        raise ValueError(
+            f"accept is {accept:g}; give the part of the signal that a circuit may leave, from 0 "
+            "to less than 1, such as 0.02"
+        )
+    return accept
 
 
 def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:

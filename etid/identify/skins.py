@@ -82,6 +82,7 @@ def identify_skin(
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
+    accept: float | None = None,
     throw: bool = True,
 ) -> Fit:
     """Identify the circuit that is connected to the driver in one recording.
@@ -104,6 +105,9 @@ def identify_skin(
             and the standard errors are its own. The remark `at_bound` says that an element would
             lie outside without its bounds; the verdict `out_of_bounds` that they contradict the
             recording. They take the methods that take known elements.
+        accept: What the circuit may leave beyond the noise, relative to the signal; 0.02 if not
+            given. A fit that leaves less is `approximate` if nothing with a name explains it, one
+            that leaves more a `misfit`. Maximum likelihood alone takes it.
         throw: Raise an error if the result cannot be used.
 
     Returns:
@@ -115,7 +119,12 @@ def identify_skin(
         IdentificationError: The result cannot be used and `throw` is set.
     """
     options = Options.of(
-        candidates_of(circuit), method=method, fixed=fixed, prior=prior, bounds=bounds
+        candidates_of(circuit),
+        method=method,
+        fixed=fixed,
+        prior=prior,
+        bounds=bounds,
+        accept=accept,
     )
     fits, chosen = candidate_fits(recording, driver, options)
     single = len(options.circuits) == 1
@@ -202,6 +211,7 @@ def identify_skins(
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
+    accept: float | None = None,
     progress: bool = False,
 ) -> Fits:
     """Identify many recordings that were made with one driver.
@@ -217,6 +227,7 @@ def identify_skins(
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
+        accept: As in `identify_skin`.
         progress: Show a progress bar.
 
     Returns:
@@ -228,7 +239,12 @@ def identify_skins(
     """
     driver = driver_of(driver)
     options = Options.of(
-        candidates_of(circuit), method=method, fixed=fixed, prior=prior, bounds=bounds
+        candidates_of(circuit),
+        method=method,
+        fixed=fixed,
+        prior=prior,
+        bounds=bounds,
+        accept=accept,
     )
     if isinstance(recordings, Study):
         study, paths = recordings, [*recordings, *recordings.problems]
@@ -261,6 +277,7 @@ def select_circuit(
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
+    accept: float | None = None,
     throw: bool = True,
 ) -> Selection:
     """The simplest circuit that a recording supports.
@@ -283,6 +300,7 @@ def select_circuit(
         fixed: As in `identify_skin`; every candidate must have these elements.
         prior: As in `identify_skin`; every candidate must have these elements.
         bounds: As in `identify_skin`; each candidate is fitted inside the bounds of its elements.
+        accept: As in `identify_skin`.
         throw: Raise an error if the fit of the chosen circuit cannot be used.
 
     Returns:
@@ -297,7 +315,9 @@ def select_circuit(
         IdentificationError: The result cannot be used and `throw` is set.
     """
     circuits = usual_circuits() if candidates is None else checked(candidates)
-    options = Options.of(circuits, method=method, fixed=fixed, prior=prior, bounds=bounds)
+    options = Options.of(
+        circuits, method=method, fixed=fixed, prior=prior, bounds=bounds, accept=accept
+    )
     fits, chosen = candidate_fits(recording, driver, options)
     selection = Selection.of(fits, chosen, circuits)
     if throw:

@@ -41,6 +41,7 @@ def identify_study(
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
+    accept: float | None = None,
     instrument: Instrument | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
     progress: bool = False,
@@ -59,6 +60,7 @@ def identify_study(
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
+        accept: As in `identify_skin`.
         instrument: As in `identify_driver`.
         plausible: As in `identify_driver`.
         progress: Show a progress bar.
@@ -70,7 +72,7 @@ def identify_study(
         ValueError: There is no loaded recording, or the method cannot use this circuit.
     """
     require("study", study, Study)
-    of_fit = FitOptions(method=method, fixed=fixed, prior=prior, bounds=bounds)
+    of_fit = FitOptions(method=method, fixed=fixed, prior=prior, bounds=bounds, accept=accept)
     options = Options.of(
         candidates_of(circuit), order=order, instrument=instrument, plausible=plausible, **of_fit
     )

@@ -15,7 +15,7 @@ from typing import Any
 import etid.identify.jointly
 import etid.nonlinear.identify
 import etid.online.state  # these modules describe their methods
-from etid.circuits.display import as_symbol, quantity, several
+from etid.circuits.display import as_symbol, per_cent, quantity, several
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, described
@@ -169,6 +169,7 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         "at 1 kHz",
         "tolerances of the instrument": _instrument(found) or "none",
         "known elements": ", ".join(settings.fixed + settings.prior + settings.bounds) or "none",
+        "a circuit may leave": f"{per_cent(settings.accept)} of the signal beyond the noise",
         "computed": f"in {settings.precision} on {settings.backend}",
         "versions": ", ".join(settings.versions),
     }

@@ -67,6 +67,7 @@ class Settings:
         precision: Floating-point type of the computation.
         backend: Backend of JAX, such as `"cpu"`.
         versions: Packages and their versions, such as `"jax 0.10.2"`.
+        accept: What a circuit may leave beyond the noise, relative to the signal.
         plausible: As in `identify_driver`.
         instrument: Tolerances of the instrument that are not 0 [SI], such as `"gain 0.001"`.
         driver: Absolute path of the file of the driver; empty if the recordings name their own
@@ -82,6 +83,7 @@ class Settings:
     fixed: tuple[str, ...]
     prior: tuple[str, ...]
     bounds: tuple[str, ...]
+    accept: float
     precision: str
     backend: str
     versions: tuple[str, ...]

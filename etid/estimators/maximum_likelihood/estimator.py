@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.directions import DIRECTIONS
+from etid.circuits.display import per_cent
 from etid.estimators.element_limits import Limits, stated_limits
 from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import (
@@ -49,6 +50,15 @@ NO_OTHER_GAIN = (
 NO_FALL = (
     "a score test finds no resistance of the load that falls with its current (at most "
     f"{DIRECTIONS['falling'].limit:.2g} standard deviations)"
+)
+
+INEXACT = (
+    "A circuit whose smooth residual noise does not explain got an unknown relative error δ of its "
+    "gain, a Gaussian process in ln f (Kennedy and O'Hagan, 2001): its size, its length and its "
+    "growth with frequency were weighed by their restricted likelihood (Patterson and Thompson, "
+    "1971), and δ is in estimates, standard errors and tests. Such a fit counts as approximate, "
+    "and was used like a successful one, if no test explains what it leaves beyond the noise, and "
+    "this is at most {} of the signal."
 )
 
 
@@ -198,7 +208,7 @@ class MaximumLikelihood(AbstractEstimator):
 
     def describe(self) -> Description:
         """The text for a methods section."""
-        return description(
+        found = description(
             "maximum likelihood",
             "the load was estimated by",
             "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
@@ -208,4 +218,8 @@ class MaximumLikelihood(AbstractEstimator):
             "several whole periods were fitted at all bins of their transforms, with the states at "
             "both ends as further unknowns."
             f"{stated(self.known_elements)}{stated_limits(self.bounds)}",
+        )
+        cited = (*found.cited, "kennedy2001", "patterson1971")
+        return dataclasses.replace(
+            found, inexact=INEXACT.format(per_cent(self.accept)), cited=cited
         )
