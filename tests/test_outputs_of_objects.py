@@ -42,7 +42,7 @@ OUTPUTS = {
     "fits": (False, [
         "fits",
         "fits[0]",
-        "fits.successful",
+        "fits.usable",
         "fits.counts()",
         "fits.where(condition='wet')",
         "fits.circuit",
