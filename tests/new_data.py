@@ -14,7 +14,7 @@ import etid
 from etid.circuits.elements import resistor
 from etid.circuits.impedance import series
 from etid.estimators.maximum_likelihood.rows import load_with
-from etid.estimators.maximum_likelihood.verdict import judged
+from etid.estimators.maximum_likelihood.verdict import ACCEPT, judged
 from etid.likelihood.fit import fit as estimated
 from etid.likelihood.gains import AbstractOutputs, Gains
 from etid.likelihood.profile import Records
@@ -53,5 +53,5 @@ def fit(gains: Gains, records: Records) -> etid.Fit:
     """The loads of recordings, side by side."""
     load, circuit = load_with(gains, records), gains.circuit
     changed = np.zeros(len(records.x), bool)
-    of = circuit, changed, verdict("successful"), "new data", None, ()
+    of = circuit, changed, verdict("successful"), "new data", None, (), ACCEPT
     return judged(estimated(load, starts(load)), *of)

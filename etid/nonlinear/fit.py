@@ -75,6 +75,7 @@ def _estimate(of: Amplitudes, state: State) -> tuple[Estimate, bool]:
         inconsistent=none,
         support=Support.unknown(kept, 1),
         effects=Effects.unknown(kept, 1),
+        approximate=none,
         tested={},
     )
     return estimate, late

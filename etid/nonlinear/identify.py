@@ -14,7 +14,7 @@ from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics, stacked, taken, unstacked
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.rows import source_of
-from etid.estimators.maximum_likelihood.verdict import judged
+from etid.estimators.maximum_likelihood.verdict import ACCEPT, judged
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import check_alike, check_distinct, circuit_of, driver_of, fed
 from etid.identify.arguments import recordings as list_of
@@ -65,7 +65,7 @@ def leaves_much(chi2: float, rrse: float) -> bool:
 def _fit(of: Amplitudes, driver: RESULTS, bounds: Limits) -> Fit:
     found, late = fit_amplitudes(of)
     none = np.zeros(1, bool)
-    fits = judged(found, of.circuit, none, driver, METHOD, of.prior, bounds)
+    fits = judged(found, of.circuit, none, driver, METHOD, of.prior, bounds, ACCEPT)
     (fit,) = unstacked(fits)
     if late:
         remarks = np.asarray(fit.remarks | int(Remark.follows_late))
