@@ -1,15 +1,18 @@
 """The choice of a circuit: rules on made-up fits, and the whole way on simulated recordings."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 
 import etid
+from benchmarks.failure_axes import Cole
+from benchmarks.inexact import inexact
 from benchmarks.ladder import LOADS as TYPICAL
 from benchmarks.ladder import recorded
 from benchmarks.perturbation_list import PERTURBATIONS
-from benchmarks.perturbed_study import PARTS, drawn_driver, undisturbed
+from benchmarks.perturbed_study import PARTS, drawn_driver, skin_is, undisturbed
 from benchmarks.selection_draws import TRUTHS, draws, errors, quantities
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
@@ -506,8 +509,26 @@ def test_the_common_circuit_of_a_study_leaves_resistances_within_their_errors(na
     assert (np.mean(np.abs(z) < 1.96, axis=0) > 0.7).all()
 
 
+@pytest.mark.parametrize(("alpha", "expected"), [(1.0, "SkinRC"), (0.9, "SkinCole")])
+def test_a_richer_circuit_is_no_remedy_for_what_no_circuit_explains(alpha, expected):
+    """A smooth error of 0.2 % of the gain is neither a spread nor a layer, and hides no spread."""
+    chosen = []
+    for number in (60, 61, 62):
+        study = inexact(
+            skin_is(functools.partial(Cole, alpha=alpha))(undisturbed(number, 60.0)), 2e-3, 1.0
+        )
+        of = study.recordings()
+        driver = etid.identify_driver(list(of.calibrations.recordings()))
+        for one in of.loaded.recordings():
+            found = etid.select_circuit(one, driver)
+            assert found.candidates[0].fit.inexact
+            chosen.append(found.candidates[0].name)
+    # One in some hundred has the shape of a fault that has a name, which a circuit may imitate.
+    assert chosen.count(expected) >= 5, chosen
+
+
 @pytest.mark.slow
-def test_three_layers_are_never_a_successful_circuit_that_is_wrong():
+def test_three_layers_are_never_a_usable_circuit_that_is_wrong():
     """No candidate has three; both that come nearest are refused by χ² above 3."""
     kind = type(etid.circuit("R0-p(R1,C1)-p(R2,C2)-p(R3,C3)"))
     layers = {"r_1": 100e3, "c_1": 0.1e-9, "r_2": 50e3, "c_2": 2e-9, "r_3": 40e3, "c_3": 20e-9}
@@ -523,4 +544,4 @@ def test_three_layers_are_never_a_successful_circuit_that_is_wrong():
         assert found.residual  # says what the candidates lack
         for fit in (found.fit, *(one.fit for one in found.candidates)):
             z = resistances_off(fit, r_s, r_p)
-            assert fit.verdict != "successful" or max(map(abs, z.values())) < 5, (number, z)
+            assert not fit.usable or max(map(abs, z.values())) < 5, (number, z)

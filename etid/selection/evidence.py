@@ -12,6 +12,10 @@ noise is large. `python -m benchmarks selection` compares the three.
 Noise that exceeds its estimate divides −2 log L: by −2 log L / n of the best candidate, if that is
 above 1 (quasi-likelihood, Wedderburn 1974).
 
+What a circuit leaves beyond the noise, as a smooth error δ of the gain, is integrated over in L
+(`etid.likelihood.approximate`). A richer circuit that only bends towards such an error gains less
+than its penalty; one that explains it needs no δ, and has far more evidence.
+
 A circuit must be adequate before it can be better. A candidate that the data contradict is chosen
 only if no candidate is adequate that has more evidence, or as much with fewer elements.
 """
