@@ -1,6 +1,7 @@
 """The residual of a fit by frequency: on the noise that the fit expects, which is what acts."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +13,11 @@ import scipy.special
 from matplotlib.colors import to_hex
 
 import etid
+from benchmarks.inexact import inexact
+from benchmarks.perturbed_study import undisturbed
 from etid.estimators.lanes import Harmonics
 from etid.plotting.bands import continuous
-from etid.plotting.by_frequency import band_of, by_frequency, sample_std
+from etid.plotting.by_frequency import LEFT, band_of, by_frequency, sample_std
 from etid.plotting.style import BLUE
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver
@@ -215,4 +218,41 @@ def test_a_driver_that_failed_is_drawn_as_far_as_it_is_known():
     unknown = jax.tree.map(lambda of: np.nan * of, driver.source)
     last = dataclasses.replace(driver, source=unknown).plot(calibration)[2]
     assert [one.get_text() for one in last.texts] == ["nothing predicted"]
+    plt.close("all")
+
+
+@functools.cache
+def behind_one_driver(size):
+    """Skin of a study, and its driver; each gain is wrong by a smooth error of this size."""
+    study = undisturbed(41, 60.0)
+    of = (inexact(study, size, 1.0) if size else study).recordings()
+    driver = etid.identify_driver(list(of.calibrations.recordings()))
+    return next(of.loaded.recordings()), driver
+
+
+def test_what_the_circuit_leaves_has_a_band_below_what_is_accepted():
+    recording, driver = behind_one_driver(0.005)
+    fit = etid.identify_skin(recording, driver)
+    found = shown(recording, driver, fit.circuit, fit)
+    used = found.selected
+    assert found.accept == 0.02
+    assert (found.left > 0).all()
+    # δ is at every frequency about as large as the error that was put into it: 95 % are below
+    # √(2 ln 20) of its 0.5 %; its size is known to a factor of two, as its few values tell it.
+    size = 0.02 * np.median((found.left / found.accepted)[used]) / np.sqrt(2 * np.log(20))
+    assert 0.0025 < size < 0.01
+    most = np.hypot(1.5 * found.noise, found.left)
+    assert np.mean((found.residual < most)[used]) > 0.9
+    axis = fit.plot()[2]
+    labels = axis.get_legend_handles_labels()[1]
+    assert labels == [LEFT, "accepted: 2 % of the signal", found.which]
+    plt.close("all")
+
+
+def test_a_circuit_that_leaves_noise_alone_has_no_such_band():
+    recording, driver = behind_one_driver(0.0)
+    fit = etid.identify_skin(recording, driver)
+    found = shown(recording, driver, fit.circuit, fit)
+    assert not found.left.any()
+    assert len(fit.plot()[2].get_legend_handles_labels()[1]) == 1
     plt.close("all")

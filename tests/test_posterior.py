@@ -55,7 +55,7 @@ def test_at_60_db_the_draws_have_the_errors_of_the_fit(clear, posterior):
 def test_the_curvature_of_the_likelihood_is_that_of_jax(clear):
     fit, *_ = clear
     lane, known, _ = given(fit, None, None)
-    load, q, cov = Minimum.of(lane, known, fit.circuit)
+    load, q, cov = Minimum.of(lane, known, fit)
     curvature = jax.jit(jax.hessian(array_function(lambda q: load.objective(q[None])[0])))(q)
     root = np.linalg.cholesky(cov)
     # By differences of steps of 3e-3 standard errors, with the rounding errors of F.

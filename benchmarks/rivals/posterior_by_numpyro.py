@@ -56,7 +56,7 @@ def compared(snr_db, seed):
     ours = fit.posterior(draws=DRAWS)
     between = time.perf_counter()
     lane, known, wanted = posterior.given(fit, None, None)
-    least = posterior.Minimum.of(lane, known, fit.circuit)
+    least = posterior.Minimum.of(lane, known, fit)
     impedances = posterior.Impedances.of_circuit(fit.circuit, least.q)
     x = np.stack([impedances.of(q) for q in drawn_by_nuts(least, impedances.powers, seed)])
     (at, own), (_, wanted) = (impedances.moments(least.q, of) for of in (least.cov, wanted))

@@ -118,7 +118,7 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
     number = names.index(name)
     if known.elements is not None and known.elements.width[number] <= FIXED:
         raise ValueError(f"{name} is fixed, so it has no profile; take another element")
-    least = Minimum.of(lane, known, fit.circuit)
+    least = Minimum.of(lane, known, fit)
     of = known, fit.circuit, number, np.sqrt(np.diagonal(cov))
     logs, deviance = _profile(least, *of)
     ends = {one: (low, high) for one, low, high in known.bounds}

@@ -7,9 +7,13 @@ half of the power in this band, so that the one-sided density is
 
 The residual is e = Y − G X, in the same unit, and E|e|² = var Y + |G|² var X are the weights of the
 likelihood. The mean of |e|² over n harmonics of noise has the gamma distribution with the shape n.
+
+Where the circuit of a fit leaves more than noise, its gain has a smooth relative error δ, and the
+residual a part |G X δ|. In a band this is one number: 95 % of it are below √(ln 20) of its size.
 """
 
 import dataclasses
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -18,18 +22,22 @@ from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import PREFIXES, several
+from etid.circuits.display import PREFIXES, per_cent, several
 from etid.estimators.estimator import NOISE
 from etid.estimators.lanes import Harmonics
-from etid.estimators.registry import named
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
+from etid.identify.inexact import discrepancy
+from etid.identify.posterior import given
 from etid.plotting.bands import fitted, used
-from etid.plotting.style import BLUE, INK, plain_ticks
+from etid.plotting.style import BLUE, INK, VIOLET, plain_ticks
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
 
 PER_DECADE = 10  # bands
+LEFT = "95 % of the noise and what the circuit leaves"
 FEWEST = 4  # harmonics of a band at least: their mean is known to 50 %
 
 
@@ -43,6 +51,9 @@ class ByFrequency:
         noise: What the fit expects of each, as a density [V/√Hz].
         selected: Harmonics that the fit used.
         which: The noise in words.
+        left: What 95 % of the parts |G X δ| do not exceed; 0 where noise explains the residual.
+        accepted: |G X| times what the circuit may leave; 0 as well.
+        accept: What the circuit may leave, relative to the signal.
     """
 
     frequency: Float[np.ndarray, " harmonic"]
@@ -50,6 +61,9 @@ class ByFrequency:
     noise: Float[np.ndarray, " harmonic"]
     selected: Bool[np.ndarray, " harmonic"]
     which: str
+    left: Float[np.ndarray, " harmonic"]
+    accepted: Float[np.ndarray, " harmonic"]
+    accept: float
 
 
 def is_white(found: Fit | Driver) -> bool:
@@ -86,9 +100,32 @@ def by_frequency(
     _, gain, _ = fitted(lane, feed, circuit)
     power = np.square(np.abs(lane.y - gain * lane.x))
     expected = lane.variance_y + np.square(np.abs(gain)) * lane.variance_x
-    residual, noise = np.sqrt(2 * samples / lane.sample_rate * np.stack([power, expected]))
+    accept, delta = _inexact(seen, feed, found, np.asarray(lane.frequency))
+    signal = np.square(np.abs(gain * lane.x))
+    of = power, expected, signal * delta**2 * np.log(20), signal * accept**2
+    residual, noise, left, accepted = np.sqrt(2 * samples / lane.sample_rate * np.stack(of))
     at, selected = map(np.asarray, (lane.frequency, lane.selected))
-    return ByFrequency(at, residual, noise, selected, _which(seen, found))
+    more = left, accepted, accept
+    return ByFrequency(at, residual, noise, selected, _which(seen, found), *more)
+
+
+def _inexact(
+    seen: Inspected,
+    feed: AbstractFeed,
+    found: Fit | Driver,
+    frequency: Float[np.ndarray, " harmonic"],
+) -> tuple[float, Float[np.ndarray, " harmonic"]]:
+    """What the circuit of a fit may leave, and the standard deviation of δ; 0 without δ."""
+    if not isinstance(found, Fit) or not found.inexact:
+        return 0.0, np.zeros(frequency.size)
+    estimator = MAXIMUM_LIKELIHOOD  # joint fits and those of a batch keep no options
+    if found.method.partition("(")[0] == estimator.name:
+        estimator = cast("MaximumLikelihood", named(found.method))
+    driver = feed if isinstance(feed, Driver) else None
+    alone = dataclasses.replace(found, method=str(estimator))
+    lane, known, _ = given(alone, seen.recording, driver)
+    std = discrepancy(found, lane, known)
+    return estimator.accept, np.interp(np.log(frequency), np.log(lane.frequency), std)
 
 
 def _which(seen: Inspected, found: Fit | Driver) -> str:
@@ -130,7 +167,8 @@ def band_of(count: int) -> Int[np.ndarray, " harmonic"]:
 def draw_by_frequency(axis: Axes, found: ByFrequency) -> None:
     """Residual in bands, the noise that the fit expects, and where 95 % of such noise lies.
 
-    Harmonics that the fit did not use are pale, and no noise is expected there.
+    Harmonics that the fit did not use are pale, and no noise is expected there. If ± contain what
+    the circuit leaves, a band of its own holds it, below what is accepted.
     """
     band, used = band_of(found.frequency.size), found.selected
     power = int(np.clip(3 * np.floor(np.log10(np.median(found.noise[used])) / 3), -15, 0))
@@ -148,6 +186,13 @@ def draw_by_frequency(axis: Axes, found: ByFrequency) -> None:
     shape, expected = number[number > 0], np.sqrt(mean(found.noise**2)) / unit
     low, high = (np.sqrt(scipy.special.gammaincinv(shape, p) / shape) for p in (0.025, 0.975))
     axis.fill_between(at, low * expected, high * expected, color="0.85", lw=0)
+    if found.left.any():
+        most = np.sqrt((high * expected) ** 2 + mean(found.left**2) / unit**2)
+        look: Any = {"color": VIOLET, "alpha": 0.25, "lw": 0}
+        axis.fill_between(at, high * expected, most, label=LEFT, **look)
+        accepted = np.sqrt(mean(found.accepted**2)) / unit
+        label = f"accepted: {per_cent(found.accept)} of the signal"
+        axis.plot(at, accepted, "--", color=VIOLET, lw=1.0, label=label)
     noise = found.noise[used] / unit
     axis.plot(found.frequency[used] / 1e3, noise, color=INK, lw=1.1, label=found.which)
     axis.set(xscale="log", yscale="log", xlabel="frequency [kHz]")
