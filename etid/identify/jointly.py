@@ -22,9 +22,11 @@ from etid.estimators.estimator import serving
 from etid.estimators.judgement import STRAINED
 from etid.estimators.lanes import AbstractLane, Harmonics, Lags, replaced, stacked, taken, unstacked
 from etid.estimators.maximum_likelihood.estimator import (
+    CITED,
     NO_OTHER_CIRCUIT,
     NO_OTHER_GAIN,
     description,
+    what_is_accepted,
 )
 from etid.estimators.maximum_likelihood.rows import estimates, loads_of, source_of
 from etid.estimators.maximum_likelihood.verdict import judged
@@ -77,17 +79,23 @@ NOT_PERIODIC = Refusal(
     "The record or its calibration holds less than two whole pulse periods, or begins in an edge. "
     "A joint fit needs whole periods. Record more of them, or identify the recording alone.",
 )
+_FOUND = description(
+    "joint maximum likelihood",
+    "each driver and all recordings made with it were estimated in one fit by",
+    "Z_th is common to all, each record has its own trigger delay τ. Where the delays scatter "
+    "by less than their errors, the upper limit of their scatter (99.99 %) is the standard "
+    "deviation of their prior. Where the current was measured beside V_th, I = X / (Z_L + "
+    "Z_th), with a delay of its own, was the second equation for each harmonic. A load with a "
+    "measured current alone needs no Z_th and was estimated alone.",
+    (NO_OTHER_CIRCUIT, NO_OTHER_GAIN),
+)
 register_description(
     METHOD,
-    description(
-        "joint maximum likelihood",
-        "each driver and all recordings made with it were estimated in one fit by",
-        "Z_th is common to all, each record has its own trigger delay τ. Where the delays scatter "
-        "by less than their errors, the upper limit of their scatter (99.99 %) is the standard "
-        "deviation of their prior. Where the current was measured beside V_th, I = X / (Z_L + "
-        "Z_th), with a delay of its own, was the second equation for each harmonic. A load with a "
-        "measured current alone needs no Z_th and was estimated alone.",
-        (NO_OTHER_CIRCUIT, NO_OTHER_GAIN),
+    dataclasses.replace(
+        _FOUND,
+        inexact="A recording whose circuit leaves more than noise did not influence the driver "
+        f"and was fitted alone. {what_is_accepted('the part of the signal that the settings accept')}",
+        cited=(*_FOUND.cited, *CITED),
     ),
 )
 

@@ -201,7 +201,7 @@ def _accepted(told: float | None, estimator: AbstractEstimator | None) -> float:
     if estimator is not None and not isinstance(estimator, MaximumLikelihood):
         raise ValueError(
             f"method {str(estimator)!r} accepts nothing beyond the noise; use the method "
-            "maximum_likelihood, or remove accept"
+            "maximum_likelihood or output_error, or remove accept"
         )
     if not 0 <= (accept := number_of("accept", told)) < 1:
         raise ValueError(

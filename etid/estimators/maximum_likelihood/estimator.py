@@ -52,14 +52,19 @@ NO_FALL = (
     f"{DIRECTIONS['falling'].limit:.2g} standard deviations)"
 )
 
-INEXACT = (
-    "A circuit whose smooth residual noise does not explain got an unknown relative error δ of its "
-    "gain, a Gaussian process in ln f (Kennedy and O'Hagan, 2001): its size, its length and its "
-    "growth with frequency were weighed by their restricted likelihood (Patterson and Thompson, "
-    "1971), and δ is in estimates, standard errors and tests. Such a fit counts as approximate, "
-    "and was used like a successful one, if no test explains what it leaves beyond the noise, and "
-    "this is at most {} of the signal."
-)
+CITED = "kennedy2001", "patterson1971"  # in the text about circuits that are not exact
+
+
+def what_is_accepted(accepted: str) -> str:
+    """Sentences about circuits that leave more than noise, of which so much is accepted."""
+    return (
+        "A circuit whose smooth residual noise does not explain got an unknown relative error δ of "
+        "its gain, a Gaussian process in ln f (Kennedy and O'Hagan, 2001): its size, its length "
+        "and its growth with frequency were weighed by their restricted likelihood (Patterson and "
+        "Thompson, 1971), and δ is in estimates, standard errors and tests. Such a fit counts as "
+        "approximate, and was used like a successful one, if no test explains what it leaves "
+        f"beyond the noise, and this is at most {accepted}."
+    )
 
 
 def description(
@@ -219,7 +224,5 @@ class MaximumLikelihood(AbstractEstimator):
             "both ends as further unknowns."
             f"{stated(self.known_elements)}{stated_limits(self.bounds)}",
         )
-        cited = (*found.cited, "kennedy2001", "patterson1971")
-        return dataclasses.replace(
-            found, inexact=INEXACT.format(per_cent(self.accept)), cited=cited
-        )
+        told = what_is_accepted(f"{per_cent(self.accept)} of the signal")
+        return dataclasses.replace(found, inexact=told, cited=(*found.cited, *CITED))
