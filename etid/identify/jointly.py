@@ -94,7 +94,8 @@ register_description(
     dataclasses.replace(
         _FOUND,
         inexact="A recording whose circuit leaves more than noise did not influence the driver "
-        f"and was fitted alone. {what_is_accepted('the part of the signal that the settings accept')}",
+        "and was fitted alone. "
+        + what_is_accepted("the part of the signal that the settings accept"),
         cited=(*_FOUND.cited, *CITED),
     ),
 )
