@@ -31,7 +31,7 @@ from benchmarks.rates import COVERED, NORMAL_95, covered, expected_covered, expe
 from benchmarks.runner import Target, at_most, option, report
 from benchmarks.spice import DATA, ESTIMATORS, FOLDER, JOINT, scene_of
 from etid.recordings.remarks import Remark
-from etid.results.verdicts import counted
+from etid.results.verdicts import USABLE, counted
 from etid.simulation.published import REFERENCE
 from etid.simulation.scenes import Scene
 
@@ -79,13 +79,13 @@ class Draws(NamedTuple):
 
     @property
     def z(self) -> np.ndarray:
-        """Errors of the successful fits in standard errors."""
-        return (self.error / self.stderr)[self.verdicts == "successful"]
+        """Errors of the usable fits in standard errors."""
+        return (self.error / self.stderr)[np.isin(self.verdicts, USABLE)]
 
     @property
     def distance(self) -> np.ndarray:
-        """Squared errors of the successful fits in their covariance: χ² of as many elements."""
-        good = self.verdicts == "successful"
+        """Squared errors of the usable fits in their covariance: χ² of as many elements."""
+        good = np.isin(self.verdicts, USABLE)
         return np.einsum(
             "ni,nij,nj->n", self.error[good], np.linalg.inv(self.cov[good]), self.error[good]
         )
@@ -193,7 +193,7 @@ def _behind_driver(
 
 def lines(name: str, of: Draws, bounds: dict[str, float]) -> Iterator[str]:
     """One line per element of a load; efficiency is bound² / mean squared error."""
-    good = of.verdicts == "successful"
+    good = np.isin(of.verdicts, USABLE)
     if good.any():
         for i, (element, limit) in enumerate(bounds.items()):
             error, z = of.error[good, i], of.z[:, i]
@@ -212,8 +212,8 @@ def lines(name: str, of: Draws, bounds: dict[str, float]) -> Iterator[str]:
 
 
 def targets(name: str, of: Draws) -> Iterator[Target]:
-    """Whether the successful fits of a load are as right as they say."""
-    draws = np.flatnonzero(of.verdicts == "successful")
+    """Whether the usable fits of a load are as right as they say."""
+    draws = np.flatnonzero(np.isin(of.verdicts, USABLE))
     inside = covered(of.z, draws)  # the elements of one fit share its error
     silent = np.sum(np.abs(of.z).max(axis=1, initial=0.0) > SILENT)
     text = f"{silent} of {len(of.verdicts)} fits; {counted(of.verdicts)}"

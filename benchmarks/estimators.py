@@ -1,7 +1,7 @@
 """Our estimators, the drivers that they share, and what their answers are: wrong, silent, refused.
 
 An element is *wrong* if it is off by more than five standard deviations of its Cramer-Rao bound,
-or by more than 20 %. It is wrong *silently* if the verdict is `successful` and five of its own
+or by more than 20 %. It is wrong *silently* if its verdict is one of `USABLE` and five of its own
 standard errors do not cover the truth either; a method that gives none covers nothing. What a fit
 says counts, not what its driver said: a batch has the fits only. Nothing is asked of an element
 whose bound exceeds 10 %. Those of skin that is not one RC are a matter of words to a few per cent:
@@ -21,7 +21,7 @@ from benchmarks.rates import Rate, rate
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named, names
 from etid.results.driver import Order
-from etid.results.verdicts import counted
+from etid.results.verdicts import USABLE, counted
 
 DEFAULT = "default"
 OURS = (DEFAULT, *names())
@@ -54,9 +54,9 @@ class Answer:
     snr_db: float = np.nan  # of the noise [dB]
 
     @property
-    def successful(self) -> bool:
+    def usable(self) -> bool:
         """Whether it claims to be right."""
-        return self.verdict == "successful"
+        return self.verdict in USABLE
 
     @property
     def refused(self) -> bool:
@@ -71,8 +71,8 @@ class Answer:
 
     @property
     def silent_elements(self) -> Bool[np.ndarray, " element"]:
-        """Wrong, called successful, and not covered by the standard errors."""
-        return self.off & ~(np.abs(self.error) <= FAR * self.stderr) & self.successful
+        """Wrong, called usable, and not covered by the standard errors."""
+        return self.off & ~(np.abs(self.error) <= FAR * self.stderr) & self.usable
 
     @property
     def determined(self) -> Bool[np.ndarray, " element"]:

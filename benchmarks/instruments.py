@@ -100,7 +100,7 @@ def rows(every: Sequence[Answer]) -> list[dict[str, Any]]:
 def row(key: tuple[str, float | str, str], of: Sequence[Answer]) -> dict[str, Any]:
     """What the answers of a group show together."""
     counts = collections.Counter(map(judged, of))
-    good = [one for one in of if one.successful]
+    good = [one for one in of if one.usable]
     found: dict[str, Any] = dict(zip(("instrument", "snr_db", "skin"), key, strict=True))
     found |= {"answers": len(of)} | {one: counts[one] for one in KINDS}
     found["median_chi2"] = float(np.nanmedian([one.chi2 for one in of]))
@@ -124,7 +124,7 @@ def targets(every: Sequence[Answer]) -> Iterator[Target]:
     data, (refused, still, inside, efficient) = list(TARGETS)[:2], list(TARGETS)[2:6]
     others = [one for one in every if one.perturbation.startswith(DATA_IS)]
     if others:
-        good = [one for one in others if one.successful]
+        good = [one for one in others if one.usable]
         yield Target.of(TARGETS, data[0], len(good), text=f"{len(good)} of {len(others)}")
         largest = max((float(np.abs(one.error / one.stderr).max()) for one in good), default=0.0)
         yield Target.of(TARGETS, data[1], largest)
@@ -134,11 +134,11 @@ def targets(every: Sequence[Answer]) -> Iterator[Target]:
         of = [one for one in every if one.perturbation.startswith(name)]
         if not of:
             continue
-        share = rate([not one.successful for one in of], [one.seed for one in of])
+        share = rate([not one.usable for one in of], [one.seed for one in of])
         yield Target.of(TARGETS, refused, share, f"{name}: ")
         silent = sum(judged(one) == "silent" for one in of)
         yield Target.of(TARGETS, still, silent, f"{name}: ")
-        good = [one for one in of if one.successful]
+        good = [one for one in of if one.usable]
         if not good:
             continue
         z = np.stack([one.error / one.stderr for one in good])

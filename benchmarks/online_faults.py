@@ -140,6 +140,6 @@ def answers(display: Display, tracker: etid.Tracker, fault: Fault) -> Answers:
         error: Float[np.ndarray, "lane element"] = np.asarray(fits.circuit.values()) - truth
         z = error / np.asarray(fits.stderr.values())
         delivered = display.charges(loads, amplitude) / charge
-        rows.append((fits.verdicts == "successful", error / truth, z, delivered))
+        rows.append((fits.fit.usable, error / truth, z, delivered))
     begin = SETTLED if fault.amplitude is None else 1  # the offset is known from then on
     return Answers(*(np.array(of)[begin:] for of in zip(*rows, strict=True)))

@@ -3,8 +3,8 @@
 Each perturbation (`benchmarks.perturbation_list`) is done to studies of several drivers, dry and
 damp skin behind each. An answer is *right* if every element is within five of its own standard
 errors of the truth and, where the bound of its standard error is 10 % at most, within 20 % of it.
-It is *refused* if it is right and not called successful, *said* if it is wrong, or missing, and not
-called successful, and *silent* if it is wrong and called successful. An element that changes during
+It is *refused* if it is right and not called usable, *said* if it is wrong, or missing, and not
+called usable, and *silent* if it is wrong and called usable. An element that changes during
 a record is wrong if one of its values is farther away than that; if the fit remarks on something
 in the recording, any of them will do. A method without standard errors is held to the bound.
 """
@@ -63,7 +63,7 @@ def kind(of: Answer) -> str:
     far = (in_stderrs(of) > FAR) & of.exact
     far |= (np.abs(of.error) > estimators.OFF) & (of.bound <= estimators.DETERMINED)
     wrong = bool(far.any() or np.isnan(of.error).any())
-    if of.successful:
+    if of.usable:
         return "silent" if wrong else "right"
     return "said" if wrong else "refused"
 
@@ -174,7 +174,7 @@ def targets(answers: Sequence[Answer]) -> Iterator[Target]:
 def _beyond(of: Answer) -> float:
     """Largest relative error of a successful answer beyond what a right one may have."""
     allowed = np.minimum(FAR * of.stderr, estimators.OFF)
-    return float(np.nanmax(np.abs(of.error) - allowed)) if of.successful else 0.0
+    return float(np.nanmax(np.abs(of.error) - allowed)) if of.usable else 0.0
 
 
 def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:

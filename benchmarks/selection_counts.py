@@ -117,7 +117,7 @@ def covered(drawn: Sequence[Drawn], *names: str) -> tuple[list[bool], list[int]]
     """For each successful choice, whether the 95 % interval holds the truth; and its driver."""
     inside, drivers = [], []
     for one in drawn:
-        if one.selection.fit.verdict != "successful":
+        if not one.selection.fit.usable:
             continue
         found = errors(one)
         for name in names:
@@ -139,7 +139,7 @@ def chosen_cells() -> list[Cell]:
 
 def is_right(one: Answer) -> bool:
     """Whether an answer is successful and no element is wrong."""
-    return one.successful and not one.wrong
+    return one.usable and not one.wrong
 
 
 def missed_elements(answers: Sequence[Answer]) -> tuple[int, int]:
@@ -156,7 +156,7 @@ def map_row(of: Cell, found: Sequence[Answer]) -> dict[str, Any]:
         "drivers": len({one.seed for one in found}),
         "trials": len(found),
         "right": float(np.mean([is_right(one) for one in found])),
-        "successful": sum(one.successful for one in found),
+        "successful": sum(one.usable for one in found),
         "silent": sum(one.silent for one in found),
         "determined": len(asked),
         "missed": sum(one.missed for one in asked),

@@ -209,7 +209,7 @@ def answer(of: Spectrum) -> Answer:
     right = np.clip(value, *np.reshape([of.truth[name] for name in names], (-1, 2)).T)
     z, relative = (value - right) / stderr, (value - right) / right
     wrong = ((np.abs(z) > SILENT) & (np.abs(relative) > NOTICED)).any() or not names
-    return Answer(fit.verdict, z, fit.verdict == "successful" and bool(wrong))
+    return Answer(fit.verdict, z, fit.usable and bool(wrong))
 
 
 OPTIONS = (

@@ -107,7 +107,7 @@ class Result(NamedTuple):
     def row(self) -> dict[str, Any]:
         """Medians of the errors, and parts of the draws, as a table has them."""
         answered, low, high = np.isfinite(self.each), *median_interval(self.each)
-        good = np.array([of.successful for of in self.answers])
+        good = np.array([of.usable for of in self.answers])
         with np.errstate(invalid="ignore"):
             medians = np.median(self._in_bounds(), axis=0)
         return {

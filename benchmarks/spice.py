@@ -126,8 +126,8 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
                 "rms": float(np.sqrt(np.mean(finite**2))) if finite.size else np.nan,
                 "bound": bound,
                 "sd": float(np.nanmedian(stderr)) if np.isfinite(stderr).any() else np.nan,
-                # Called successful, and wrong by more than 5 bounds and 5 of its own errors.
-                "silent": int(np.sum((fits.verdicts == "successful") & (np.abs(error) > 5 * own))),
+                # Called usable, and wrong by more than 5 bounds and 5 of its own errors.
+                "silent": int(np.sum(fits.fit.usable & (np.abs(error) > 5 * own))),
             }
         )
     return rows

@@ -7,7 +7,7 @@ changes all parts of the driver, independently. Printed is the coverage (with th
 
 With `--fault N` one kind at a time is exactly N tolerances wrong, up or down; only the record of
 the skin is late then. Printed is the part of the fits that report anything, beside that of the best
-test behind the usual driver (`benchmarks.visibility`), and the part that is silent: `successful`
+test behind the usual driver (`benchmarks.visibility`), and the part that is silent: usable
 and wrong by more than `SILENT` of its standard errors. Left out are a wrong resistor, which is
 invisible, a capacitance across it, of which little is visible, and a drift, which is not one error.
 """
@@ -28,6 +28,7 @@ from benchmarks.rates import rate
 from benchmarks.runner import WORKERS, Target, each, option, report
 from etid.circuits.directions import DIRECTIONS
 from etid.results.instrument import ERRORS
+from etid.results.verdicts import USABLE
 
 SILENT = 4.0  # standard errors
 FIRST = 5000  # number of the first driver
@@ -119,9 +120,9 @@ def answers(
 
 def found(name: str, of: Draws, best: float) -> Target:
     """The part of the fits that report anything, which is to be as large as that of the best."""
-    told = rate(of.verdicts != "successful", range(of.verdicts.size))
+    told = rate(~np.isin(of.verdicts, USABLE), range(of.verdicts.size))
     wrong = (np.abs(of.error / of.stderr) > SILENT).any(axis=1)
-    silent = rate(wrong & (of.verdicts == "successful"), range(of.verdicts.size))
+    silent = rate(wrong & np.isin(of.verdicts, USABLE), range(of.verdicts.size))
     text = f"{told}, best test {best:.0%}; silent {silent}"
     return Target(f"{name}: found", told.rate, best, text=text, interval=(told.low, told.high))
 
