@@ -129,12 +129,11 @@ def test_a_part_of_the_signal_is_from_0_to_less_than_1(study, accept):
         etid.identify_study(study, accept=accept)
 
 
-def test_what_a_circuit_may_leave_is_an_option_of_methods_with_a_likelihood(study):
+def test_what_a_circuit_may_leave_is_an_option_of_maximum_likelihood(study):
     """As a keyword or of the estimator; others accept nothing beyond the noise."""
     of = MaximumLikelihood(accept=0.3)
-    assert Options.of(method="output_error", accept=0.1).accept == 0.1
     assert Options.of(method=of).given_to(of) == of
     assert Options.of(method=of, accept=0.1).given_to(of) == MaximumLikelihood(accept=0.1)
     assert Options.of().given_to(MaximumLikelihood()) == MaximumLikelihood(accept=0.02)
-    with pytest.raises(ValueError, match="'steiglitz_mcbride' accepts nothing beyond the noise"):
-        etid.identify_study(study, accept=0.1, method="steiglitz_mcbride")
+    with pytest.raises(ValueError, match="'output_error' accepts nothing beyond the noise"):
+        etid.identify_study(study, accept=0.1, method="output_error")

@@ -13,12 +13,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import per_cent
 from etid.estimators.element_limits import stated_limits
 from etid.estimators.element_prior import stated
 from etid.estimators.estimator import BY_RESIDUALS, CHECKED, DETERMINED, NOISE, Description
 from etid.estimators.lanes import AbstractLane, Bins
-from etid.estimators.maximum_likelihood.estimator import CITED, MaximumLikelihood, what_is_accepted
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.precision import namespace
 from etid.recordings.preflight import Inspected
@@ -69,7 +68,6 @@ class OutputError(MaximumLikelihood):
     Attributes:
         known_elements: As in `MaximumLikelihood`.
         bounds: As in `MaximumLikelihood`.
-        accept: As in `MaximumLikelihood`.
     """
 
     with_current: bool = dataclasses.field(default=False, init=False)
@@ -107,8 +105,7 @@ class OutputError(MaximumLikelihood):
             f"{stated(self.known_elements)}{stated_limits(self.bounds)}",
             conditions=(*CHECKED, DETERMINED),
             errors=BY_RESIDUALS,
-            inexact=what_is_accepted(f"{per_cent(self.accept)} of the signal"),
             refined=True,
             noise=NOISE,
-            cited=("ljung1999", "optimistix2024", "white1980", *CITED),
+            cited=("ljung1999", "optimistix2024", "white1980"),
         )

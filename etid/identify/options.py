@@ -5,7 +5,7 @@ import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import TypedDict, Unpack
+from typing import TypedDict, TypeGuard, Unpack
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.verdict import ACCEPT
+from etid.estimators.output_error import OutputError
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, WITH_CURRENT, Method, named
 from etid.identify.arguments import (
     Interval,
@@ -133,7 +134,7 @@ class Options:
         Raises:
             ValueError: It takes no known elements and no bounds.
         """
-        if isinstance(estimator, MaximumLikelihood) and estimator.accept != self.accept:
+        if _accepts(estimator) and estimator.accept != self.accept:
             estimator = dataclasses.replace(estimator, accept=self.accept)
         if not self.known and not self.bounds:
             return estimator
@@ -194,14 +195,19 @@ class Options:
             checked_limits(self.bounds, self.known, self.circuits)
 
 
+def _accepts(estimator: AbstractEstimator | None) -> TypeGuard[MaximumLikelihood]:
+    """Whether an estimator accepts circuits that leave more than noise."""
+    return isinstance(estimator, MaximumLikelihood) and not isinstance(estimator, OutputError)
+
+
 def _accepted(told: float | None, estimator: AbstractEstimator | None) -> float:
     """What a circuit may leave: as the caller or the requested estimator says, else `ACCEPT`."""
     if told is None:
-        return estimator.accept if isinstance(estimator, MaximumLikelihood) else ACCEPT
-    if estimator is not None and not isinstance(estimator, MaximumLikelihood):
+        return estimator.accept if _accepts(estimator) else ACCEPT
+    if estimator is not None and not _accepts(estimator):
         raise ValueError(
             f"method {str(estimator)!r} accepts nothing beyond the noise; use the method "
-            "maximum_likelihood or output_error, or remove accept"
+            "maximum_likelihood, or remove accept"
         )
     if not 0 <= (accept := number_of("accept", told)) < 1:
         raise ValueError(

@@ -99,7 +99,8 @@ class Minimum(NamedTuple):
         delays = np.zeros(load.gains.outputs.count)
         start = np.concatenate([np.log(circuit.values()), delays, load.gains.source.mean])
         found = minimum(load, start[None, None])
-        if fit.usable and is_smooth(found.near.condensed.part, load.gains.exact).any():
+        whole = load.transient is None  # δ is in fits of whole periods alone
+        if fit.usable and whole and is_smooth(found.near.condensed.part, load.gains.exact).any():
             raise ValueError(
                 "the circuit of this fit leaves more than noise, and ± contain it; its likelihood, "
                 "which does not, has no draws and no profiles. Use fit.intervals()"
