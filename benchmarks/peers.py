@@ -19,11 +19,11 @@ from jaxtyping import Float
 import etid
 from benchmarks.ladder import recorded
 from etid.circuits.circuit import SkinRC
-from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.rows import load_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
+from etid.likelihood.driver import MAX_STEPS
 from etid.likelihood.profile import Profile
 from etid.likelihood.search import Load, minimum
 from etid.likelihood.source import Source

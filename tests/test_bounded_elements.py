@@ -1,7 +1,5 @@
 """Elements with bounds: estimates, errors and their coverage, files, commands, and wrong bounds."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,12 +11,11 @@ import etid
 from etid import cli
 from etid.circuits.display import quantity
 from etid.estimators.element_limits import truncated, within
-from etid.estimators.judgement import SUCCESSFUL, judged
 from etid.recordings.remarks import Remark
 from etid.results.fit import Support
 from etid.results.verdicts import verdict
 from tests.test_current import SKIN, recorded
-from tests.test_judging import estimate
+from tests.test_judging import estimate, judged
 
 
 @pytest.fixture(scope="module")
@@ -139,11 +136,11 @@ def test_intervals_of_three_bounded_elements_hold_what_the_guide_says(from_bound
 
 def test_bounds_far_away_change_nothing_and_those_that_contradict_the_data_are_no_success():
     of = estimate(relative=(0.05, 0.02, 0.03))
-    free = judged(of, etid.SkinRC(), SUCCESSFUL, "a method")
+    free = judged(of, etid.SkinRC())
 
     def bounded(errors):
         bounds = (("r_s", above(free, errors), np.inf),)
-        return judged(of, etid.SkinRC(), SUCCESSFUL, "a method", bounds)
+        return judged(of, etid.SkinRC(), bounds=bounds)
 
     far = bounded(-10.0)
     np.testing.assert_allclose(far.circuit.values(), free.circuit.values(), rtol=1e-9)
@@ -155,10 +152,10 @@ def test_bounds_far_away_change_nothing_and_those_that_contradict_the_data_are_n
 
 def test_an_element_that_only_its_bounds_determine_is_no_more_insensitive():
     of = estimate(relative=(1.5, 0.02, 0.03))
-    assert judged(of, etid.SkinRC(), SUCCESSFUL, "a method").verdict == "insensitive"
-    known = judged(of, etid.SkinRC(), SUCCESSFUL, "a method", (("r_s", 1e4, 3e4),))
+    assert judged(of, etid.SkinRC()).verdict == "insensitive"
+    known = judged(of, etid.SkinRC(), bounds=(("r_s", 1e4, 3e4),))
     assert known.verdict == "successful"
-    failed = judged(of, etid.SkinRC(), verdict("nonphysical"), "a method", (("r_s", 1e4, 3e4),))
+    failed = judged(of, etid.SkinRC(), verdict("nonphysical"), (("r_s", 1e4, 3e4),))
     assert failed.verdict == "driver_failed"
 
 
@@ -237,10 +234,10 @@ def test_a_choice_compares_each_circuit_inside_its_own_bounds(noisy, free):
     assert type(chosen.fit.circuit) is etid.SkinRC
     of = estimate(relative=(0.05, 0.02, 0.03))
     support = Support(jnp.array(10.0), jnp.array(100.0), *[jnp.zeros(of) for of in (9, (), 3, ())])
-    of = dataclasses.replace(of, support=support)
-    alone = judged(of, etid.SkinRC(), SUCCESSFUL, "a method")
+    of = of._replace(support=support)
+    alone = judged(of, etid.SkinRC())
     bounds = ("r_s", above(alone, 2.0), np.inf), ("r", 1.0, 2.0)
-    told = judged(of, etid.SkinRC(), SUCCESSFUL, "a method", bounds)
+    told = judged(of, etid.SkinRC(), bounds=bounds)
     assert told.support is not None
     # The likeliest point inside is two standard errors away.
     np.testing.assert_allclose(told.support.deviance, 14.0, rtol=1e-6)

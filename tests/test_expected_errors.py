@@ -79,7 +79,7 @@ def independent(driver, skin, resistors):
     noise = np.array(of.variance_y[0]) + np.abs(gains(start)) ** 2 * np.array(of.variance_x[0])
     weight = np.where(np.array(of.selected[0]), 2 * np.maximum(power, 0) / noise, 0.0)
     information = np.einsum("imk,mk,jmk->ij", np.conj(slopes), weight, slopes).real
-    # The priors of `etid.estimators.estimate.prior`, and half a sample for each delay.
+    # The priors of `etid.likelihood.source_prior`, and half a sample for each delay.
     large = 10 * REFERENCE
     widths = [3.0, 3.0, 1.5, 1.5, 0.5, *[large] * 4, 3.0, large]
     prior = [*np.full(3, np.inf), *np.full(1 + len(resistors), 0.5), *widths]

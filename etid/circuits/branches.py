@@ -28,9 +28,9 @@ EQUAL = 1e-9  # relative difference of impedances that are rounded differently
 
 def in_order(
     circuit: AbstractCircuit,
-    logs: Float[Array | np.ndarray, " element"],
+    logs: Float[Array | np.ndarray, "*row element"],
     *told: Float[Array | np.ndarray, " element"],
-) -> Int[Array | np.ndarray, " element"]:
+) -> Int[Array | np.ndarray, "*row element"]:
     """Places of the elements, such that branches which can be exchanged are in their order.
 
     Args:
@@ -40,18 +40,19 @@ def in_order(
             things are known cannot be exchanged.
 
     Returns:
-        The places: `logs[places]` is in order.
+        The places: `logs[..., places]` is in order.
     """
-    places: Any = np.arange(logs.size)
+    xp: Any = namespace(logs, *told)
+    places: Any = np.arange(logs.shape[-1]) + xp.zeros(logs.shape, int)
     for branches in exchangeable(type(circuit)):
         for one, other in itertools.combinations(branches, 2):
-            swap = np.arange(logs.size)
+            swap = np.arange(logs.shape[-1])
             swap[[*one, *other]] = [*other, *one]
-            now = logs[places]
+            now = xp.take_along_axis(logs, places, -1)
             wrong = _log_time(circuit, now, one) > _log_time(circuit, now, other)
             for of in told:
                 wrong = wrong & (of[np.array(one)] == of[np.array(other)]).all()
-            places = namespace(logs, *told).where(wrong, places[swap], places)
+            places = xp.where(wrong[..., None], places[..., swap], places)
     return places
 
 
@@ -91,7 +92,7 @@ def _log_time(circuit: AbstractCircuit, logs: Any, branch: Branch) -> Any:
     time constant, such as one resistor, has the sum of its logarithms.
     """
     units = [list(circuit.units().values())[place] for place in branch]
-    values = [logs[place] for place in branch]
+    values = [logs[..., place] for place in branch]
     if "second" in units:
         return values[units.index("second")]
     exponents = [value for value, unit in zip(values, units, strict=True) if unit == "1"]

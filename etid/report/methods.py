@@ -16,9 +16,9 @@ import etid.identify.jointly
 import etid.nonlinear.identify
 import etid.online.state  # these modules describe their methods
 from etid.circuits.display import as_symbol, per_cent, quantity, several
-from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, described
+from etid.likelihood.driver import MAX_STEPS
 from etid.report.html import Section, Table, template
 from etid.results.driver import ContinuousDriver
 from etid.results.fits import AND, Fits

@@ -6,6 +6,7 @@ the cause, then the remedy.
 
 import functools
 import operator
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,10 +14,10 @@ import jax
 import jax.core
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from etid.circuits.overview import Overviewed
-from etid.precision import Module
+from etid.precision import Module, namespace
 from etid.signals.transfer import AnyArray
 
 
@@ -204,10 +205,21 @@ class Judged(Overviewed, Module):
 
 def verdicts_of(names: np.ndarray) -> RESULTS:
     """The verdicts of many lanes from their names: the inverse of `verdict_names`."""
-    item = RESULTS.successful
     values = [int(verdict(str(name))._value) for name in np.ravel(names)]
-    leaves, tree = jax.tree.flatten(item)
-    return jax.tree.unflatten(tree, [np.reshape(values, np.shape(names)).astype(leaves[0].dtype)])
+    return _of_codes(np.reshape(values, np.shape(names)))
+
+
+def first_reason(reasons: Sequence[tuple[Bool[AnyArray, "*row"], str]]) -> RESULTS:
+    """The verdicts of rows: the first whose reason holds, else `successful`."""
+    conditions, names = zip(*reasons, strict=True)
+    codes = [int(verdict(name)._value) for name in names]
+    xp = namespace(*conditions)
+    return _of_codes(xp.select(list(conditions), codes, int(verdict("successful")._value)))
+
+
+def _of_codes(codes: Int[AnyArray, "*row"]) -> RESULTS:
+    leaves, tree = jax.tree.flatten(RESULTS.successful)
+    return jax.tree.unflatten(tree, [codes.astype(leaves[0].dtype)])
 
 
 @functools.cache

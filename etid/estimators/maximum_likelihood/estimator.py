@@ -195,7 +195,7 @@ class MaximumLikelihood(AbstractEstimator):
         prior = ElementPrior.of(self.known_elements, circuit)
         of = driver, known, circuit, str(self), prior, self.bounds
         if is_traced((lane, driver, known)):
-            return fit_one(jax.tree.map(jnp.asarray, lane), *of)
+            return fit_one(jax.tree.map(jnp.asarray, lane), *of, self.accept)
         return taken(fit_rows([lane], *of, self.accept)[0], 0)
 
     def fit_rows(

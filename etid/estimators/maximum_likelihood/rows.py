@@ -13,7 +13,7 @@ from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.lanes import Bins, Harmonics, HarmonicsWithCurrent, stacked
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.verdict import judged, judged_one
+from etid.estimators.maximum_likelihood.verdict import judged
 from etid.likelihood.fit import Estimate, fit
 from etid.likelihood.gains import Gains, Voltage, VoltageAndCurrent
 from etid.likelihood.profile import Records
@@ -118,16 +118,15 @@ def fit_one(
     known: GivenDriver,
     circuit: AbstractCircuit,
     method: str,
-    prior: ElementPrior | None = None,
-    bounds: Limits = (),
+    prior: ElementPrior | None,
+    bounds: Limits,
+    accept: float,
 ) -> Fit:
     """The fit of a recording by JAX, which can transform it."""
     load = load_of(lane, source_of(known), circuit, prior, calibrated(known))
     found = fit(load, starts(load), known.aside)
-    if known.shape is not None:
-        changed = differs(known.shape, load.records)
-        found = found._replace(inconsistent=found.inconsistent | changed)
-    return judged_one(found, circuit, driver.result, method, bounds, prior)
+    changed = False if known.shape is None else differs(known.shape, load.records)
+    return judged(found, circuit, changed, driver.result, method, prior, bounds, accept)
 
 
 def estimates(
