@@ -128,7 +128,7 @@ limited(of, current_cap=np.inf) -> ampere
 limited(of, charge_cap=200.0) -> never act
 limited(of, fallback=np.inf) -> infinite
 etid.Controller.of(dataclasses.replace(of.tracker, driver_result=verdict('misfit')))
-    -> driver of the tracker was not identified
+    -> driver of the tracker cannot be used
 of.controller.command(of.state) -> either charge or current
 of.controller.command(of.state, charge=-1e-09) -> finite and not negative
 of.controller.command(of.state, current=np.ones(3)) -> shape \(3,\)

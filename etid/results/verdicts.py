@@ -206,7 +206,7 @@ class Judged(Overviewed, Module):
 def verdicts_of(names: np.ndarray) -> RESULTS:
     """The verdicts of many lanes from their names: the inverse of `verdict_names`."""
     values = [int(verdict(str(name))._value) for name in np.ravel(names)]
-    return _of_codes(np.reshape(values, np.shape(names)))
+    return _of_codes(np.reshape(np.array(values, int), np.shape(names)))
 
 
 def first_reason(reasons: Sequence[tuple[Bool[AnyArray, "*row"], str]]) -> RESULTS:
