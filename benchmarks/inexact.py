@@ -90,9 +90,10 @@ def inexact(study: lab.Study, size: float, length: float) -> lab.Study:
 def answers(
     number: int, snr_db: float, size: float, length: float, parts: float
 ) -> list[tuple[np.ndarray, ...]]:
-    """Errors and ± of each skin, and errors of a fit that knows the covariance of δ.
+    """Errors and ± of each skin, and errors of two other fits.
 
-    They are those of the logarithms of the elements; ± is NaN if the fit cannot be used.
+    One knows the covariance of δ, the other has the weights of the noise. They are those of the
+    logarithms of the elements; ± is NaN if the fit cannot be used.
     """
     study = inexact(lab.undisturbed(number, snr_db, parts), size, length)
     of = study.recordings()
@@ -103,21 +104,22 @@ def answers(
         fit = etid.identify_skin(one, driver, throw=False)
         values, errors = np.asarray(fit.circuit.values()), np.asarray(fit.stderr.values())
         own = np.log(values) - truth, errors / values if fit.usable else np.full(3, np.nan)
-        found.append((*own, _knowing(one, driver, fit, size, length) - truth))
+        others = _others(one, driver, fit, size, length)
+        found.append((*own, *(of - truth for of in others)))
     return found
 
 
-def _knowing(
+def _others(
     one: etid.Recording, driver: etid.Driver, fit: etid.Fit, size: float, length: float
-) -> np.ndarray:
-    """Logarithms of the elements, by a fit that knows the covariance of δ."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithms of the elements, by a fit that knows the covariance of δ, and by the noise."""
     lane = Harmonics.of(Inspected.of(one))
     known = known_of(lane, driver, False, MAXIMUM_LIKELIHOOD)
     load = loads_of([lane], source_of(known), SkinRC(), None, None)
-    start = starts(load)[0]
+    start, by_noise = starts(load)[0], minimum(load, starts(load)).q[0, :3]
     start[:, :3] = np.log(np.asarray(fit.circuit.values()))  # its own minimum is near
     load = with_delta(load, covariance(nodes(load.records.x.shape[-1]), size, length)[None])
-    return minimum(load, extended(load, start)[None]).q[0, :3]
+    return minimum(load, extended(load, start)[None]).q[0, :3], by_noise
 
 
 def main(arguments: argparse.Namespace) -> bool:
@@ -129,13 +131,15 @@ def main(arguments: argparse.Namespace) -> bool:
         tasks = [(number, snr_db, size, length, arguments.parts) for number in numbers]
         done = dict(each(answers, tasks, arguments.workers, "driver", "inexact"))
         for path, rows in zip(lab.LOADS, zip(*done.values(), strict=True), strict=True):
-            error, stderr, best = np.moveaxis(np.array(rows), 1, 0)
+            error, stderr, best, by_noise = np.moveaxis(np.array(rows), 1, 0)
             used = np.isfinite(stderr).all(-1)
             name = f"{snr_db:g} dB, δ {size:.2%}, length {length:g}, {path}"
             of = np.sqrt(np.mean(error[used] ** 2, 0) / np.mean(best[used] ** 2, 0))
             covered = np.mean(np.abs(error[used]) < 1.96 * stderr[used], 0)
             print(f"{name}: {used.mean():.0%} usable; rms error "
-                  f"{', '.join(f'{one:.2%}' for one in np.sqrt(np.mean(error[used] ** 2, 0)))}; "
+                  f"{', '.join(f'{one:.2%}' for one in np.sqrt(np.mean(error[used] ** 2, 0)))}, by "
+                  "weights of the noise "
+                  f"{', '.join(f'{one:.2%}' for one in np.sqrt(np.mean(by_noise ** 2, 0)))}; "
                   f"± {', '.join(f'{one:.2%}' for one in np.median(stderr[used], 0))}; within "
                   f"{', '.join(f'{one:.2f}' for one in covered)}", flush=True)  # fmt: skip
             asked += [

@@ -3,8 +3,8 @@
 A residual that noise does not explain is smooth in frequency: condensed to the knots, it keeps its
 squares, while those of noise become few. Such loads get a δ (`etid.likelihood.discrepancy`) of the
 size that the data say (`etid.likelihood.restricted`), and are fitted anew. Weights of the noise
-trust the strongest harmonics to 1e-4; an error of 0.2 % of the gain then costs 3 to 4 % in the
-elements, with δ 0.3 to 0.5 %.
+trust the strongest harmonics to 1e-4; an error of 0.2 % of the gain then costs 2 to 4 % in R_s and
+C_p, with δ 0.4 to 0.7 % (`python -m benchmarks inexact`).
 """
 
 import dataclasses
