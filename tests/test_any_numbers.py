@@ -14,7 +14,7 @@ from benchmarks.specimens import study_fits
 from etid import cli
 from etid.commands import fit as fit_command
 from etid.results.study_fits import StudyFits
-from etid.results.verdicts import RESULTS, verdict, verdicts_of
+from etid.results.verdicts import RESULTS, USABLE, verdict, verdicts_of
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -38,7 +38,7 @@ def drawn(seed):
 
     names = rng.choice(VERDICTS, 6)
     fit = jax.tree.map(replaced, base.fits.fit)
-    good = names == "successful"  # for which elements are positive
+    good = np.isin(names, USABLE)  # for which elements are positive
     circuit = jax.tree.map(lambda v: np.where(good & ~(v > 0), LARGE, v), fit.circuit)
     change = [replaced(np.ones((6, 4))) for _ in range(2)]
     fit = dataclasses.replace(

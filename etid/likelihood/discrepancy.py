@@ -19,7 +19,6 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-import scipy.interpolate
 from jaxtyping import Complex, Float
 
 from etid.precision import array_function, namespace
@@ -41,6 +40,8 @@ def nodes(harmonics: int) -> Float[np.ndarray, " node"]:
 @functools.lru_cache(maxsize=16)
 def splines(harmonics: int) -> Float[np.ndarray, "node bin"]:
     """The function of each node, which is 1 there and 0 at the others, at all harmonics."""
+    import scipy.interpolate  # a fifth of a second, which exact circuits do not need
+
     every = nodes(harmonics)
     unit = scipy.interpolate.CubicSpline(every, np.eye(every.size))
     return np.ascontiguousarray(unit(np.log(np.arange(1, harmonics + 1))).T)
