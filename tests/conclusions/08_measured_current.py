@@ -10,10 +10,11 @@ assert fixed.stderr.c_p < fit.stderr.c_p
 if cell is not None:
     assert abs(float(cell.circuit.r_p) / 500e6 - 1) < 0.01  # the maker's tolerances
     assert abs(float(cell.circuit.c_p) / 33e-12 - 1) < 0.10
-    assert cell.verdict == "misfit"
+    assert cell.usable
     assert cell.rrse < 0.002
 for selection in tissue.values():
     assert type(selection.fit.circuit) is etid.SkinCole
     # With a χ² of 29 000 the last digits decide whether output error settles in its flat valley.
     assert selection.fit.verdict in ("misfit", "max_steps_reached")
-    assert selection.fit.rrse < 0.017
+    # Least squares in time leave 0.7 to 1.4 %, weights of the noise by frequency 1.0 to 1.9 %.
+    assert selection.fit.rrse < 0.02
