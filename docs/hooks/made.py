@@ -69,7 +69,7 @@ def commands():
 # What one does with a name, by the package that has it.
 TASKS = {
     "Read, import and export recordings": ("recordings", "files"),
-    "Identify": ("identify", "selection"),
+    "Identify": ("identify", "selection", "nonlinear"),
     "Use the results": ("results",),
     "Show and share": ("plotting", "report"),
     "Simulate and plan": ("simulation",),
