@@ -6,9 +6,8 @@ of the fit. Standard errors contain it like any measurement. A fixed element has
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.precision import Module, namespace
@@ -58,10 +57,6 @@ class ElementPrior(Module):
         """Starts with the known elements at their means."""
         xp = namespace(logs, self.width)
         return xp.where(xp.isfinite(self.width), self.centre, logs)
-
-    def exact(self, values: Float[Array, " element"]) -> Float[Array, " element"]:
-        """Estimates [SI], in which fixed elements are as they were told, to the last digit."""
-        return jnp.where(self.width <= FIXED, self.told, values)
 
 
 def require_element(name: str, circuit: AbstractCircuit) -> None:

@@ -15,8 +15,15 @@ from jaxtyping import Float
 
 from etid.estimators.element_limits import stated_limits
 from etid.estimators.element_prior import stated
-from etid.estimators.estimator import BY_RESIDUALS, CHECKED, DETERMINED, NOISE, Description
-from etid.estimators.lanes import AbstractLane, Bins
+from etid.estimators.estimator import (
+    BY_RESIDUALS,
+    CHECKED,
+    DETERMINED,
+    NOISE,
+    AbstractEstimator,
+    Description,
+)
+from etid.estimators.lanes import Bins
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.precision import namespace
@@ -74,15 +81,9 @@ class OutputError(MaximumLikelihood):
     name = "output_error"
     lane = OutputBins
 
-    def lane_of(self, seen: Inspected) -> type[AbstractLane]:
-        """The bins of any record."""
-        del seen
-        return self.lane
-
-    def lane_of_periods(self, periods: int) -> type[AbstractLane]:
-        """The bins of any record."""
-        del periods
-        return self.lane
+    # The bins of any record, of whole periods or not.
+    lane_of = AbstractEstimator.lane_of
+    lane_of_periods = AbstractEstimator.lane_of_periods
 
     def known(
         self,

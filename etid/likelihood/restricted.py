@@ -120,15 +120,13 @@ def _marginal(
     weight = square / (1 + square * eigen)
     reduced = whole - (told * weight[..., None]).swapaxes(-1, -2) @ told
     sizes = diagonal(reduced)
-    sound = (np.isfinite(sizes) & (sizes[..., : count + 1] > 0).all(-1, keepdims=True)).all(-1)
+    sound = np.isfinite(sizes).all(-1) & (sizes[..., : count + 1] > 0).all(-1)
     reduced = np.where(sound[..., None, None], reduced, np.eye(reduced.shape[-1]))
     scale = np.sqrt(np.maximum(diagonal(reduced), 0.0))
     scale = np.where(scale > 0, scale, 1.0)
     scaled = reduced / scale[..., :, None] / scale[..., None, :]
-    own, beside = (
-        scaled[..., :count, :count] + SMALLEST * np.eye(count),
-        scaled[..., :count, count:],
-    )
+    own = scaled[..., :count, :count] + SMALLEST * np.eye(count)
+    beside = scaled[..., :count, count:]
     rest = np.linalg.solve(own, beside)
     size = scale[..., count, None]
     left = scaled[..., count, count:] - (beside[..., :1] * rest).sum(-2)

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from etid.circuits.directions import DIRECTIONS, ON_LOADS
 from etid.circuits.display import per_cent
@@ -168,11 +168,6 @@ class Effects(Module):
         """Those of fits whose estimator does not compute them: NaN."""
         sizes = (len(BUDGETED), elements), (len(BUDGETED),), (elements,)
         return cls(*(np.full((*lane, *size), np.nan) for size in sizes))
-
-    def of_elements(self, places: Int[Array | np.ndarray, " element"]) -> "Effects":
-        """The effects on the elements at these places; for one fit."""
-        moved, discrepancy = self.moved[:, places], self.discrepancy[places]
-        return dataclasses.replace(self, moved=moved, discrepancy=discrepancy)
 
     @property
     def unstated(self) -> dict[str, Float[np.ndarray, " element"]]:

@@ -102,15 +102,6 @@ def normal_equations(
     return NormalEquations.of(r, jacobian.T)
 
 
-def best_start(
-    residual: Callable[[Float[Array, " parameter"]], Float[Array, " sample"]],
-    starts: Float[Array, "start parameter"],
-) -> Float[Array, " parameter"]:
-    """The start with the smallest finite Σ r²."""
-    objectives = jax.lax.map(lambda y: jnp.sum(residual(y) ** 2), starts)
-    return starts[jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))]
-
-
 Residual = Callable[[Array, Any], tuple[Array, Any]]
 """A residual function of optimistix: (y, args) to the residual and an auxiliary output."""
 
