@@ -278,6 +278,20 @@ def driver_of(value: Driver | None) -> Driver | None:
     return value
 
 
+def check_no_filters(recording: Recording, what: str) -> None:
+    """Refuse a recording whose current and V_out have passed different known filters.
+
+    Raises:
+        RecordingError: It states one, and has no `v_th`, whose filter is that of V_out.
+    """
+    if recording.cause == "current" and recording.filters is not None:
+        raise RecordingError(
+            f"has a known filter of one channel, which {what} does not take",
+            field="recording",
+            remedy="Use identify_skin or identify_skins",
+        ).located(path=recording.path)
+
+
 def fed(recording: Recording, driver: Driver | None) -> tuple[Recording, AbstractFeed]:
     """A recording and its feed: the driver, or without a driver the measured current.
 

@@ -96,8 +96,8 @@ class Minimum(NamedTuple):
         circuit = fit.circuit
         driver = source_of(known.driver), circuit, known.elements, calibrated(known.driver)
         load = loads_of([lane], *driver)
-        delays = np.zeros(load.gains.outputs.count)
-        start = np.concatenate([np.log(circuit.values()), delays, load.gains.source.mean])
+        rest = np.zeros(load.gains.exact - load.gains.elements)
+        start = np.concatenate([np.log(circuit.values()), rest, load.gains.source.mean])
         found = minimum(load, start[None, None])
         whole = load.transient is None  # δ is in fits of whole periods alone
         if fit.usable and whole and is_smooth(found.near.condensed.part, load.gains.exact).any():

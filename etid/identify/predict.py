@@ -20,7 +20,7 @@ from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.circuits.impedance import realise
 from etid.estimators.estimator import serving
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.arguments import fed, given_circuit
+from etid.identify.arguments import check_no_filters, fed, given_circuit
 from etid.precision import array_function, held, in_float64, namespace, one_thread, untraced
 from etid.recordings.inspection import Inspection
 from etid.recordings.preflight import Inspected
@@ -62,6 +62,7 @@ def predict(
             response of the circuit in time is not known and the record holds no whole period.
     """
     recording, feed = fed(recording, driver)
+    check_no_filters(recording, "a prediction in time")
     if circuit is not None:
         load = given_circuit("circuit", circuit)
     elif recording.r_load is not None:

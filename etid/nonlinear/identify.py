@@ -16,7 +16,14 @@ from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.rows import source_of
 from etid.estimators.maximum_likelihood.verdict import ACCEPT, judged
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
-from etid.identify.arguments import check_alike, check_distinct, circuit_of, driver_of, fed
+from etid.identify.arguments import (
+    check_alike,
+    check_distinct,
+    check_no_filters,
+    circuit_of,
+    driver_of,
+    fed,
+)
 from etid.identify.arguments import recordings as list_of
 from etid.identify.fitting import known_of, remarks_on
 from etid.identify.options import Interval, Options, plan
@@ -134,6 +141,8 @@ def identify_amplitudes(
     of = list_of("recordings", recordings)
     check_alike("recordings", of)
     fed_by = [fed(one, driver)[0] for one in of]
+    for one in fed_by:
+        check_no_filters(one, "a fit of several amplitudes")
     check_distinct("recordings", of)
     seen = [Inspected.of(one) for one in fed_by]
     for one in seen:

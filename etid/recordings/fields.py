@@ -16,6 +16,7 @@ import numpy as np
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, near_miss
 from etid.recordings.resistance import resistance
+from etid.signals.low_pass import Filters, LowPass
 
 Type = Literal["text", "paths", "label", "number", "range", "samples"]
 
@@ -290,6 +291,28 @@ class AbstractFields:
         "`etid.Instrument`. All calibrations of a driver state the same.",
         example="gain=1e-3 r_load=1e-3",
     )
+    v_out_filter: str | None = _field(
+        "text",
+        forbidden="calibration",
+        description="Low-pass that `v_out` has passed and `current` has not: kind (bessel or "
+        "butterworth), order, corner of -3 dB [Hz], and the corner's standard deviation [Hz] if it "
+        "is uncertain. It counts for a recording without `v_th`.",
+        example="butterworth 1 80000",
+    )
+    current_filter: str | None = _field(
+        "text",
+        forbidden="calibration",
+        description="Low-pass that `current` has passed and `v_out` has not, in the same words.",
+        example="bessel 4 2000 100",
+    )
+
+    @property
+    def filters(self) -> Filters | None:
+        """The filters of `v_out` and `current`; None if neither is stated."""
+        stated = [getattr(self, name) for name in FILTERS]
+        if stated == [None, None]:
+            return None
+        return Filters.of(*(None if one is None else LowPass.read(one) for one in stated))
 
 
 DECLARED: dict[str, Field] = {
@@ -305,6 +328,8 @@ DESCRIBING = {
     if field.type in ("label", "number") and field.required == "optional"
 }
 
+
+FILTERS = "v_out_filter", "current_filter"  # known filters of one channel
 
 Number = float | np.integer | np.floating
 
@@ -328,6 +353,8 @@ class Given(TypedDict, total=False):
     calibration: str | Sequence[str] | None
     adc_range: Sequence[Number] | None
     instrument: str | None
+    v_out_filter: str | None
+    current_filter: str | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -358,6 +385,17 @@ class Metadata(AbstractFields):
                 field="instrument",
                 remedy="State it in the calibrations of this recording",
             )
+        for name in FILTERS:
+            if (stated := getattr(self, name)) is None:
+                continue
+            if self.r_load is not None:
+                raise RecordingError(
+                    "a calibration has none: V_th and V_out pass the same filter", field=name
+                )
+            try:
+                LowPass.read(stated)
+            except ValueError as error:
+                raise RecordingError(str(error), field=name) from None
 
     def of_trial(self, path: str, trial: str) -> "Metadata":
         """The same with the path and the label of a trial, which no check concerns."""

@@ -64,6 +64,8 @@ class Inspected:
         other = self.by_current
         if other is None or self.kept is not None or other.kept is not None:
             return False
+        if self.recording.filters is not None:
+            return False  # V_th, which V_out has its filter in common with, has another one
         return self.periods == other.periods
 
     @property

@@ -77,14 +77,18 @@ def load_of(
     if shared is not None and shared.x.shape[-1] == records.x.shape[-1]:
         same = same_unloaded(records.x[..., None, :], shared.x)
         unloaded = Unloaded.by(shared, records, same)
-    gains = Gains(source, circuit, lane.frequency, lane.sample_rate.reshape(-1)[0], outputs)
+    rate, filters = lane.sample_rate.reshape(-1)[0], lane.filters
+    gains = Gains(source, circuit, lane.frequency, rate, outputs, filters=filters)
     load = load_with(gains, records, prior, unloaded)
     if not isinstance(lane, Bins):
         return load
     assert source.decays is not None
-    first, rate = lane.frequency.reshape(-1)[0], gains.sample_rate
+    first = lane.frequency.reshape(-1)[0]
     of = source.decays * first, ends(lane.x.shape[-1]) * (first / rate), width_of(y, used)
     transient = Transient(*of, behind=source.loaded is not None)
+    if filters is not None:
+        of_x = width_of(lane.x[..., None, :], used)[..., 0]
+        transient = transient.filtered(filters, lane.frequency, of_x)
     return dataclasses.replace(load, transient=transient)
 
 
@@ -94,15 +98,16 @@ def load_with(
     prior: ElementPrior | None = None,
     unloaded: Unloaded | None = None,
 ) -> Load:
-    """Recordings of any outputs, with the priors of elements, delays and source."""
+    """Recordings of any outputs, with the priors of elements, delays, corners and source."""
     source, count, delays = gains.source, gains.elements, gains.outputs.count
     xp, own = namespace(source.mean, source.delay_width), (np.zeros(count), np.full(count, np.inf))
     if prior is not None:
         own = prior.centre, prior.width
     # How little the delays of V_out scatter tells nothing about those of other outputs.
     of_delays = xp.reshape(source.delay_width, 1), np.full(delays - 1, DELAY_WIDTH)
-    centre = xp.concatenate([own[0], np.zeros(delays), source.mean])
-    width = xp.concatenate([own[1], *of_delays, np.ones(source.mean.size)])
+    corners = gains.exact - gains.delays.stop  # [their standard deviations]
+    centre = xp.concatenate([own[0], np.zeros(delays + corners), source.mean])
+    width = xp.concatenate([own[1], *of_delays, np.ones(corners + source.mean.size)])
     return Load(gains, records, centre, width, unloaded)
 
 
