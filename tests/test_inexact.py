@@ -111,6 +111,19 @@ def test_what_has_a_name_is_no_such_error(change):
             assert not one.usable, path
 
 
+def test_its_profiles_contain_it():
+    """Draws would be of all coefficients of δ."""
+    fits, *_ = fits_of("δ0.002 1", 41)
+    for one in fits.values():
+        for name in ("r_s", "r_p"):
+            value, error = (getattr(of, name) for of in (one.circuit, one.stderr))
+            low, high = one.profile(name).interval()
+            # Skewed a little: 1.96 ± is 0.95 of it.
+            np.testing.assert_allclose([value - low, high - value], 1.96 * error, rtol=0.15)
+        with pytest.raises(ValueError, match="profile"):
+            one.posterior()
+
+
 def test_its_share_of_the_errors_is_told():
     fits, _, driver, records = fits_of("δ0.002 1", 41)
     for one in records:
