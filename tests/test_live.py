@@ -481,8 +481,8 @@ def test_a_pause_and_a_counter_that_begins_anew_cost_a_rest_and_stop_is_obeyed_i
         rested = len(ticks)
 
         def began_anew():
-            # A counter goes back by a pause. While the display rests, nobody would say so; and only pulses that were
-            # counted since the first rest can be seen to begin anew.
+            # A counter goes back by a pause. While the display rests, nobody would say so; and only
+            # pulses that were counted since the first rest can be seen to begin anew.
             counted = len(ticks) > rested and ticks[-1].state.electrodes.pulses.max() > 10
             if counted and display.number > PAUSE + 5 and display.given[-1].any():
                 display.again = True
