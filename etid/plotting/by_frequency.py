@@ -90,8 +90,7 @@ def by_frequency(
     """
     lane = used(seen, feed, circuit, found.remarks)
     size = seen.noise.power.shape[-1]  # padded harmonics follow
-    every = jax.tree.leaves(dataclasses.replace(lane, filters=None))
-    lane = Harmonics(*(of[:size] if np.ndim(of) else of for of in every))
+    lane = Harmonics(*(of[:size] if np.ndim(of) else of for of in jax.tree.leaves(lane)))
     samples = seen.periods[1]
     if is_white(found):
         white = np.square(seen.trusted) / samples
