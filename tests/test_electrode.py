@@ -116,7 +116,7 @@ def electrode(of: Case) -> tuple[Any, ...]:
     sums = [[-150.0 if of.gain else 1.0, 90.0, 2.0], [1.0, 1.0, 0.0]]
     scores = SCORES(np.array(sums), np.array([0.5, -8.0]))
     result = GOOD if of.found else BAD
-    noise = np.zeros(4), np.zeros((0, 4))
+    noise = np.zeros(4), np.zeros((0, 4)), np.zeros(4)
     found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, result, scores, *noise)
     own = np.array([*(OLD[:2] + 1e-3), 0.3]) if of.near else FRESH
     result = RESULT[of.fresh]
@@ -574,7 +574,8 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(monkeypatch):
     @jax.jit
     @jax.vmap
     def alone(spread, result):
-        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), zero, zero, result, scores, zero, zero)
+        rest = zero, zero, result, scores, zero, zero, zero
+        fit = ATTEMPT(jnp.zeros(3), two, jnp.diag(spread), *rest)
         monkeypatch.setattr(tick, "attempt", lambda *_: fit)
         return anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two).result
 

@@ -8,9 +8,9 @@ import pytest
 
 import etid
 from benchmarks import perturbed_study as lab
-from benchmarks.inexact import inexact
+from benchmarks.inexact import covariance, inexact
 from benchmarks.perturbation_list import change_of
-from etid.estimators.lanes import Harmonics
+from etid.estimators.lanes import Bins, Harmonics
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.rows import loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
@@ -20,11 +20,13 @@ from etid.likelihood.discrepancy import FUNCTIONS, Discrepancy, kernels, nodes, 
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import VoltageAndCurrent
 from etid.likelihood.restricted import LEVELS, restricted
-from etid.likelihood.search import minimum
+from etid.likelihood.search import Anew, Near, minimum
 from etid.likelihood.starts import starts
 from etid.recordings.preflight import Inspected
+from etid.results.feed import MEASURED_CURRENT
 
 HARMONICS = 1500
+DRY = etid.SkinRC(33e3, 186e3, 0.12e-9)
 
 
 @functools.cache
@@ -109,6 +111,19 @@ def test_what_has_a_name_is_no_such_error(change):
             assert not one.usable, path
 
 
+def test_its_profiles_contain_it():
+    """Draws would be of all coefficients of δ."""
+    fits, *_ = fits_of("δ0.002 1", 41)
+    for one in fits.values():
+        for name in ("r_s", "r_p"):
+            value, error = (getattr(of, name) for of in (one.circuit, one.stderr))
+            low, high = one.profile(name).interval()
+            # Skewed a little: 1.96 ± is 0.95 of it.
+            np.testing.assert_allclose([value - low, high - value], 1.96 * error, rtol=0.15)
+        with pytest.raises(ValueError, match="profile"):
+            one.posterior()
+
+
 def test_its_share_of_the_errors_is_told():
     fits, _, driver, records = fits_of("δ0.002 1", 41)
     for one in records:
@@ -152,13 +167,81 @@ def test_a_joint_fit_leaves_them_alone():
     assert np.all(np.abs(off) < 4 * np.asarray(rows["inexact"].stderr.values()))
 
 
-def test_records_of_a_single_period_are_misfits():
-    """What the error does to the states at their ends is not known."""
-    study = inexact(lab.lasting(3400)(lab.undisturbed(44, 60.0)), 0.003, 1.0)
-    of = study.recordings()
-    driver = etid.identify_driver(list(of.calibrations.recordings()))
-    for one in of.loaded.recordings():
-        assert etid.identify_skin(one, driver, throw=False).verdict == "misfit"
+@pytest.mark.slow
+def test_errors_of_a_single_period_contain_it():
+    """Behind a driver, of records of one period and a bit."""
+    z, verdicts = [], []
+    for number in range(44, 48):
+        study = inexact(lab.lasting(3400)(lab.undisturbed(number, 60.0)), 0.003, 1.0)
+        of = study.recordings()
+        driver = etid.identify_driver(list(of.calibrations.recordings()))
+        for one in of.loaded.recordings():
+            found = etid.identify_skin(one, driver, throw=False)
+            verdicts.append(found.verdict)
+            if found.verdict == "approximate":
+                off = np.asarray(found.circuit.values()) - study.truths[str(one.path)].low
+                z.append(off / np.asarray(found.stderr.values()))
+    assert len(z) >= 5  # others look like a fault that has a name
+    assert np.mean(np.abs(z) < 1.96) >= 0.8  # of 15 numbers and more: less in one of fifty sets
+    assert np.abs(z).max() < 5
+
+
+def cut(rng: np.random.Generator, samples: int, first: int, size: float, length: float):
+    """A record of current and V_out of dry skin that begins anywhere, with a δ of V_out."""
+    f = 60.0 * np.arange(1, 1600)
+    edges = [np.exp(-2j * np.pi * f * t) for t in (7.0e-3, 7.2e-3, 7.4e-3)]
+    pulse = 0.06 * (edges[0] - 2 * edges[1] + edges[2]) / (2j * np.pi * f)  # 1 mA
+    pulse = pulse / (1 + (f / 60e3) ** 8)
+    x = np.linspace(0.0, np.log(f.size), 80)
+    root = np.linalg.cholesky(covariance(x, size, length) + 1e-10 * size**2 * np.eye(80))
+    real, imaginary = (np.interp(np.log(f / 60.0), x, root @ rng.standard_normal(80))
+                       for _ in range(2))  # fmt: skip
+    z = np.asarray(DRY.response(f)) * np.exp(real + 1j * imaginary)
+    wave = np.exp(2j * np.pi * np.outer((first + np.arange(samples)) / 200e3, f))
+    both = 2 * (wave @ np.stack([pulse, pulse * z], 1)).real.T
+    noise = 1e-3 * np.abs(both).max(-1, keepdims=True)
+    current, v_out = both + noise * rng.standard_normal(both.shape)
+    return etid.Recording(v_out=v_out, current=current, sample_rate=200e3, pulse_rate=60.0)
+
+
+@pytest.mark.parametrize(("samples", "first"), [(3400, 0), (5200, 1350)])
+def test_errors_of_records_cut_anywhere_contain_it(samples, first):
+    """By a measured current; the second record begins in a pulse. Noise hides δ of some."""
+    z, left = [], []
+    for number in range(10):
+        rng = np.random.default_rng([number, 7])
+        found = etid.identify_skin(cut(rng, samples, first, 0.005, 0.5), throw=False)
+        if found.verdict == "approximate":
+            off = np.asarray(found.circuit.values()) - np.array(DRY.values())
+            z.append(off / np.asarray(found.stderr.values()))
+            left.append(found.inexact)
+    assert len(z) >= 4
+    assert all(left)
+    assert np.mean(np.abs(z) < 1.96) >= 0.8  # of 12 numbers and more: less in one of fifty sets
+    assert np.abs(z).max() < 5
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_gradient_of_a_record_with_states(filtered):
+    """That of the condensed terms is that of the whole likelihood, also for δ of the states."""
+    one = cut(np.random.default_rng(1), 5200, 1350, 0.005, 0.5)
+    if filtered:
+        one = one.replace(current_filter="bessel 4 1e4 300", v_out_filter="butterworth 1 3e4")
+    lane = Bins.of(Inspected.of(one))
+    known = known_of(lane, MEASURED_CURRENT, False, MAXIMUM_LIKELIHOOD)
+    load = loads_of([lane], source_of(known), DRY, None, None)
+    load = with_delta(load, 1e-4 * kernels(lane.size)[5][None])
+    q = 0.3 * np.random.default_rng(0).normal(size=(1, load.gains.owned))
+    q[:, :3] = np.log(DRY.values()) + np.array([0.01, -0.01, 0.01])
+    q[:, load.gains.exact :] *= 0.3
+    at = load.gains.at(load.knots.index)
+    found = Anew(load, at).at(Near.of(load, at, q)).gradient[0]
+    step, exact = 1e-4, load.gains.exact
+    for i in (*range(exact), exact + 10, exact + 30, exact + 35):
+        move = step * np.eye(q.size)[i]
+        change = (load.objective(q + move) - load.objective(q - move))[0] / (2 * step)
+        # Sums at the knots are good to 3e-3; without what δ makes of the states, 3 to 15 % are off.
+        np.testing.assert_allclose(found[i], change, rtol=5e-3)
 
 
 def test_a_row_does_not_depend_on_others():

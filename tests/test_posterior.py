@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks.inexact import inexact
 from benchmarks.ladder import LOADS
-from benchmarks.perturbed_study import undisturbed
 from etid.identify.posterior import Impedances, Minimum, given, inside, stretched
 from etid.precision import array_function
 from etid.results.posterior import Profile
@@ -210,14 +208,3 @@ def test_a_fixed_element_costs_no_effective_draws():
     for fixed in ({}, {"c_p": 0.66e-9}):
         fit = etid.identify_skin(recording, driver, fixed=fixed, throw=False)
         assert fit.posterior(draws=200).effective > 60, fixed
-
-
-def test_errors_that_contain_what_the_circuit_leaves_have_no_likelihood_to_draw_from():
-    """Its minimum is that of weights of the noise, some ± away."""
-    of = inexact(undisturbed(41, 60.0), 0.005, 1.0).recordings()
-    driver = etid.identify_driver(list(of.calibrations.recordings()))
-    fit = etid.identify_skin(next(of.loaded.recordings()), driver)
-    assert fit.inexact
-    for ask in (fit.posterior, lambda: fit.profile("r_s")):
-        with pytest.raises(ValueError, match="leaves more than noise, and ± contain it"):
-            ask()

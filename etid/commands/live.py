@@ -40,6 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--change", type=float, default=3e-3, help="of the skin [1/√pulse]; default: 0.003"
     )
+    parser.add_argument(
+        "--discrepancy",
+        type=float,
+        default=0.0,
+        help="what the circuit leaves of the signal, as a fit of such skin says; default: 0",
+    )
     parser.add_argument("--speed", type=float, default=1.0, help="of a file; 1: real time")
     parser.add_argument("--port", type=int, default=PORT, help=f"of the page; default: {PORT}")
 
@@ -52,6 +58,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         records[0],
         electrodes=arguments.electrodes,
         change=arguments.change,
+        discrepancy=arguments.discrepancy,
     )
     cap = {} if arguments.charge_cap is None else {"charge_cap": arguments.charge_cap}
     controller = Controller.of(tracker, **cap)

@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,13 +31,14 @@ from etid.signals.harmonics import (
     harmonics_of,
     joins_aliases,
 )
-from etid.signals.hold import of_hold
 from etid.signals.lags import rest
-from etid.signals.noise import Measurement, floor, noise_of
+from etid.signals.low_pass import Filters
+from etid.signals.noise import Measurement, noise_of
 from etid.signals.rounding import rounding_variance
-from etid.signals.transfer import AnyArray
+from etid.signals.transfer import power
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
+_Harmonics = TypeVar("_Harmonics", bound="Harmonics")
 LANES = 64  # recordings that are fitted together
 
 
@@ -115,6 +117,8 @@ class Harmonics(AbstractLane):
 
     Attributes:
         sample_rate: Sampling rate [Hz].
+        filters: The known filters of V_out and of the current that causes it; None without any.
+            Both records have passed both.
     """
 
     periodic = True
@@ -126,11 +130,12 @@ class Harmonics(AbstractLane):
     variance_y: Float[Array | np.ndarray, "*lane harmonic"]
     selected: Bool[Array | np.ndarray, "*lane harmonic"]
     sample_rate: Float[Array | np.ndarray, "*lane"]
+    filters: Filters | None = eqx.field(kw_only=True, default=None)
 
     @classmethod
     def of(cls, seen: Inspected) -> "Harmonics":
         """Aligned harmonics of a recording; its noise may be 1/f or rounding too."""
-        return cls(*cls._fields(seen))
+        return cls(*cls._fields(seen))._filtered(seen)
 
     @classmethod
     def of_several(cls, seen: Sequence[Inspected]) -> "list[AbstractLane]":
@@ -141,7 +146,23 @@ class Harmonics(AbstractLane):
         """
         fields = [cls._fields(one) for one in seen]
         structure = jax.tree.structure(cls(*fields[0]))
-        return [structure.unflatten(one) for one in fields]
+        lanes = [structure.unflatten(one) for one in fields]
+        return [one._filtered(of) for one, of in zip(lanes, seen, strict=True)]
+
+    def _filtered(self: _Harmonics, seen: Inspected) -> _Harmonics:
+        """The same after each record has passed the known filter of the other one."""
+        filters = seen.recording.filters if seen.has_current else None
+        if filters is None:
+            return self
+        of_v_out, of_current = filters(self.frequency)
+        return dataclasses.replace(
+            self,
+            x=self.x * of_v_out,
+            y=self.y * of_current,
+            variance_x=self.variance_x * power(of_v_out),
+            variance_y=self.variance_y * power(of_current),
+            filters=filters,
+        )
 
     @staticmethod
     def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
@@ -186,7 +207,7 @@ class Harmonics(AbstractLane):
     def fields(self) -> Spectrum:
         """The harmonics without the sample rate."""
         of = (self.frequency, self.x, self.y, self.variance_x, self.variance_y, self.selected)
-        return Spectrum(*of, whole=self.periodic, held=isinstance(self, Held))
+        return Spectrum(*of, whole=self.periodic)
 
     @property
     def spectrum(self) -> Spectrum:
@@ -241,7 +262,7 @@ class Bins(Harmonics):
     def of_first(cls, seen: Inspected, samples: int) -> "Bins":
         """The lane of the first samples of the overlap."""
         of = seen.bins_of_first(samples).fields
-        return cls(*[*of, np.asarray(seen.recording.sample_rate)])
+        return cls(*[*of, np.asarray(seen.recording.sample_rate)])._filtered(seen)
 
     @classmethod
     def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "Bins":
@@ -263,40 +284,6 @@ class Bins(Harmonics):
     def realigned(self, late: Lags) -> "Bins":
         """Refused: samples at one end would have to come from the other."""
         raise NotImplementedError("make the lane of the realigned recording")
-
-
-class Held(Bins):
-    """The same of a command that a converter holds between samples: X is that of the staircase.
-
-    It is the command itself, so that it has no noise but its rounding.
-    """
-
-    @staticmethod
-    def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
-        """The fields of a lane, in their order."""
-        return *_held(seen.bins.fields, seen), np.asarray(seen.recording.sample_rate)
-
-    @classmethod
-    def of_first(cls, seen: Inspected, samples: int) -> "Held":
-        """The lane of the first samples of the overlap."""
-        of = _held(seen.bins_of_first(samples).fields, seen)
-        return cls(*[*of, np.asarray(seen.recording.sample_rate)])
-
-    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> Lags:
-        """No samples: an output shows its command within the sample in which this is held."""
-        del circuit, driver
-        return Lags(0)
-
-
-def _held(fields: tuple[AnyArray, ...], seen: Inspected) -> tuple[AnyArray, ...]:
-    """The fields of a `Spectrum` of samples of a command, as those of its staircase."""
-    frequency, x, y, variance_x, *rest = fields
-    hold, samples = (
-        of_hold(np.asarray(frequency) / seen.recording.sample_rate),
-        seen.aligned[0].size,
-    )
-    (least, _) = floor(seen.limits, seen.inspection.step[seen.row]) ** 2 / samples
-    return frequency, x * hold, y, least + 0 * variance_x, *rest
 
 
 class HarmonicsWithCurrent(Harmonics):

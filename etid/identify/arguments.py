@@ -91,7 +91,7 @@ def check_distinct(field: str, recordings: Sequence[Recording]) -> None:
 
 
 def check_alike(field: str, recordings: Sequence[Recording]) -> None:
-    """Refuse recordings of different lengths, rates or holds.
+    """Refuse recordings of different lengths or rates.
 
     Raises:
         RecordingError: There is none, or one differs from the first.
@@ -102,8 +102,7 @@ def check_alike(field: str, recordings: Sequence[Recording]) -> None:
     def of(one: Recording) -> str:
         size = one.samples["v_out"].stored.size
         rates = f"sample_rate {one.sample_rate} Hz, pulse_rate {one.pulse_rate} Hz"
-        held = "" if one.hold is None else f", hold {one.hold}"
-        return f"{several(size, 'sample')}, {rates}{held}"
+        return f"{several(size, 'sample')}, {rates}"
 
     for number, one in enumerate(recordings):
         if of(one) != of(recordings[0]):
@@ -277,6 +276,20 @@ def driver_of(value: Driver | None) -> Driver | None:
     if value is not None:
         require("driver", value, Driver)
     return value
+
+
+def check_no_filters(recording: Recording, what: str) -> None:
+    """Refuse a recording whose current and V_out have passed different known filters.
+
+    Raises:
+        RecordingError: It states one, and has no `v_th`, whose filter is that of V_out.
+    """
+    if recording.cause == "current" and recording.filters is not None:
+        raise RecordingError(
+            f"has a known filter of one channel, which {what} does not take",
+            field="recording",
+            remedy="Use identify_skin or identify_skins",
+        ).located(path=recording.path)
 
 
 def fed(recording: Recording, driver: Driver | None) -> tuple[Recording, AbstractFeed]:

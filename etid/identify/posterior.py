@@ -36,6 +36,7 @@ from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.fitting import fits_of, is_shared, known_of
+from etid.likelihood.approximate import approximated
 from etid.likelihood.noise import is_smooth
 from etid.likelihood.search import ROWS, Load, minimum
 from etid.precision import array_function, in_float64, one_thread
@@ -88,23 +89,16 @@ class Minimum(NamedTuple):
 
     @classmethod
     def of(cls, lane: Harmonics, known: Known, fit: Fit) -> "Minimum":
-        """The minimum near a fit.
-
-        Raises:
-            ValueError: Its standard errors contain what its circuit leaves, and F does not.
-        """
+        """The minimum near a fit; with δ if the standard errors contain what its circuit leaves."""
         circuit = fit.circuit
         driver = source_of(known.driver), circuit, known.elements, calibrated(known.driver)
         load = loads_of([lane], *driver)
-        delays = np.zeros(load.gains.outputs.count)
-        start = np.concatenate([np.log(circuit.values()), delays, load.gains.source.mean])
+        rest = np.zeros(load.gains.exact - load.gains.elements)
+        start = np.concatenate([np.log(circuit.values()), rest, load.gains.source.mean])
         found = minimum(load, start[None, None])
-        whole = load.transient is None  # δ is in fits of whole periods alone
-        if fit.usable and whole and is_smooth(found.near.condensed.part, load.gains.exact).any():
-            raise ValueError(
-                "the circuit of this fit leaves more than noise, and ± contain it; its likelihood, "
-                "which does not, has no draws and no profiles. Use fit.intervals()"
-            )
+        if fit.usable and is_smooth(found.near.condensed.part, load.gains.exact).any():
+            of = approximated(load, found.near, start[None])
+            load, found = of.load, of.least
         rows, q = found.near.jacobian[0], found.q[0]
         root = inverse_root(rows @ rows.T + np.diag(1 / load.width**2))
         return cls(load, q, _inverse_curvature(load, q, root))
@@ -232,6 +226,11 @@ def posterior(
         raise ValueError(f"draws is {draws}; it must be at least 1, as in 1000")
     lane, known, cov = given(fit, recording, driver)
     load, least, own = Minimum.of(lane, known, fit)
+    if load.gains.discrepancy is not None:
+        raise ValueError(
+            "the circuit of this fit leaves more than noise, and ± contain it; the unknown numbers "
+            "of what it leaves are too many for draws. Use fit.profile or fit.intervals()"
+        )
     if not np.isfinite(own).all():
         raise _undetermined(fit)
     impedances = Impedances.of_circuit(fit.circuit, least)

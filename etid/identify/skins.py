@@ -107,8 +107,7 @@ def identify_skin(
             recording. They take the methods that take known elements.
         accept: What the circuit may leave beyond the noise, relative to the signal; 0.02 if not
             given. A fit that leaves less is `approximate` if nothing with a name explains it, one
-            that leaves more a `misfit`. Maximum likelihood takes it, for records of whole
-            periods.
+            that leaves more a `misfit`. Maximum likelihood takes it.
         throw: Raise an error if the result cannot be used.
 
     Returns:

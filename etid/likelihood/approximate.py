@@ -17,7 +17,7 @@ from jaxtyping import Bool, Complex, Float
 from etid.likelihood import scores
 from etid.likelihood.discrepancy import POWERS, Discrepancy, kernels, splines
 from etid.likelihood.restricted import Restricted, restricted
-from etid.likelihood.search import Load, Minimum, Near, minimum, select
+from etid.likelihood.search import Load, Minimum, Near, minimum, of_load, select
 
 ORDINARY = 2 * POWERS.size + 1  # number of the kernel to begin with
 ROUNDS = 2  # the size of δ is chosen again where its first choice has led
@@ -53,7 +53,7 @@ def approximated(load: Load, near: Near, start: Float[np.ndarray, "row q"]) -> A
         near: The likelihood near their minima.
         start: Other starts: weights of the noise may have led far away.
     """
-    left = _left(near)
+    left = _left(load, near)
     harmonics = load.records.x.shape[-1]
     flat = kernels(harmonics)[ORDINARY]
     of = with_delta(load, left[:, None, None] ** 2 * flat)
@@ -74,9 +74,11 @@ def approximated(load: Load, near: Near, start: Float[np.ndarray, "row q"]) -> A
     return Approximation(of, least, explains)
 
 
-def _left(near: Near) -> Float[np.ndarray, " row"]:
+def _left(load: Load, near: Near) -> Float[np.ndarray, " row"]:
     """What the circuit leaves beyond noise, relative to the signal."""
-    terms, signal = near.condensed.part, near.condensed.rows(near.slopes.gains[:, None])[:, 0]
+    terms, states = near.condensed.part, of_load(load, near)
+    states = None if states is None else states[:, None]
+    signal = near.condensed.rows(near.slopes.gains[:, None], states)[:, 0]
     beyond = (terms**2).sum(-1) - (terms != 0).sum(-1)
     return np.sqrt(np.maximum(beyond, 0.0) / (signal**2).sum(-1))
 
@@ -131,14 +133,17 @@ def _restricted(
     at = splines(harmonics)[:, load.knots.index]
     unit = np.eye(outputs)[:, None, :, None] * at[:, None, :]  # output, node, output, knot
     unit = unit.reshape(-1, outputs, at.shape[-1])
-    unit = near.slopes.gains[:, None] * unit
-    rows = near.condensed.rows(np.concatenate([unit, 1j * unit, *changes.values()], 1))
-    count = 2 * unit.shape[1]
-    known = np.concatenate([_exact_rows(load, jacobian), terms[:, None], rows[:, count:]], 1)
+    of_gains, states = near.slopes.gains[:, None] * unit, of_load(load, near)
+    both = np.concatenate([of_gains, 1j * of_gains], 1)
+    if states is not None:
+        states = np.concatenate([states[:, None] * unit, 1j * states[:, None] * unit], 1)
+    rows = near.condensed.rows(both, states)
+    of_changes = near.condensed.rows(np.concatenate(list(changes.values()), 1))
+    known = np.concatenate([_exact_rows(load, jacobian), terms[:, None], of_changes], 1)
     precision = without_delta(load, 1 / load.width**2)
     pull = precision * without_delta(load, near.q - load.centre)
     precision = np.broadcast_to(precision, pull.shape)
-    of = known, rows[:, :count], precision, pull, left
+    of = known, rows, precision, pull, left
     # Numbers of a search that failed are none.
     known, unknown, precision, pull, left = (np.nan_to_num(one) for one in of)
     return restricted(known, unknown, precision, pull, left, harmonics, 2 * outputs)

@@ -89,15 +89,14 @@ def fit(
 ) -> Estimate:
     """The fits from their starts; for the arguments see `etid.likelihood.search.minimum`.
 
-    Where a circuit leaves more than the noise, NumPy fits records of whole periods anew with what
-    it leaves (`etid.likelihood.approximate`). Under JAX elements and delays have derivatives, and
+    Where a circuit leaves more than the noise, NumPy fits records anew with what it leaves
+    (`etid.likelihood.approximate`). Under JAX elements and delays have derivatives, and
     nothing else.
     """
     least = minimum(load, starts, aside)
     logs, delays, z = load.gains.split(least.q)
     found = _estimate(load, least)._replace(logs=logs, delays=delays, z=z)
-    # What δ does to the states at the ends of a record is no function of a few of them.
-    if namespace(least.q) is not np or load.transient is not None:
+    if namespace(least.q) is not np:
         return found
     smooth = is_smooth(least.near.condensed.part, load.gains.exact)
     if smooth.any():

@@ -1,18 +1,16 @@
 """The gains of a load: each output per input, with its delay, and their derivatives.
 
 The parameters q of a fit are the logarithms of the elements, the delay of each output [samples],
-and z of `etid.likelihood.source`. All act on a frequency through Z_L, the phase factors of the
-delays, and W.
+the errors of the corners of known filters (`etid.signals.low_pass`), and z of
+`etid.likelihood.source`. All act on a frequency through Z_L, the phase factors of the delays, the
+factor F of the corners, and W.
 
 Errors of the instrument that act on loads change them as `DIRECTIONS` says,
 
     V_out / V_th = (1 + g) Z' / (Z' + Z_th) + κ,      Z' = Z_L ‖ C.
 
-Behind a command that a converter holds, each output has what the images of the hold add
-(`etid.signals.hold`).
-
 What no circuit explains multiplies each output by e^δ, where δ is smooth in frequency
-(`etid.likelihood.discrepancy`); its coefficients are parameters after the delays.
+(`etid.likelihood.discrepancy`); its coefficients are parameters after the corners.
 
 Another kind of data is another class of outputs.
 """
@@ -32,7 +30,7 @@ from etid.likelihood.discrepancy import Discrepancy
 from etid.likelihood.profile import along_outputs
 from etid.likelihood.source import Source
 from etid.precision import Module, namespace
-from etid.signals.hold import added
+from etid.signals.low_pass import Filters
 from etid.signals.transfer import AnyArray, as_complex, frequency_variable, reciprocal, turns
 
 FAULTS = len(ON_LOADS)  # errors of the instrument that act on a load
@@ -111,9 +109,7 @@ class Gains:
         sample_rate: Sampling rate [Hz].
         outputs: The outputs.
         discrepancy: δ; None where the model is exact.
-        images: What the images of a held command add (`etid.signals.hold.images`); None if none is
-            held.
-        nodes: The same loads at the nodes of `images`.
+        filters: The known filters of V_out and of a current that causes it; None without any.
     """
 
     source: Source
@@ -122,8 +118,7 @@ class Gains:
     sample_rate: Float[AnyArray, ""] | float
     outputs: AbstractOutputs = dataclasses.field(default_factory=Voltage)
     discrepancy: Discrepancy | None = None
-    images: Complex[AnyArray, "part bin"] | None = None
-    nodes: "Gains | None" = None
+    filters: Filters | None = None
 
     @property
     def elements(self) -> int:
@@ -132,38 +127,54 @@ class Gains:
 
     @property
     def exact(self) -> int:
-        """Number of parameters of an exact model: elements and delays."""
-        return self.elements + self.outputs.count
+        """Number of parameters of an exact model: elements, delays and corners."""
+        return self.delays.stop + (0 if self.filters is None else 2)
+
+    @property
+    def delays(self) -> slice:
+        """The places of the delays among the parameters."""
+        return slice(self.elements, self.elements + self.outputs.count)
 
     @property
     def owned(self) -> int:
-        """Number of own parameters: elements, delays, and coefficients of δ."""
+        """Number of own parameters: elements, delays, corners, and coefficients of δ."""
         return self.exact + (
             0 if self.discrepancy is None else self.discrepancy.count(self.outputs.count)
         )
 
     def split(self, q: Float[AnyArray, "*row q"]) -> tuple[AnyArray, ...]:
         """Logarithms of the elements, delays [samples], and z."""
-        return q[..., : self.elements], q[..., self.elements : self.exact], q[..., self.owned :]
+        return q[..., : self.elements], q[..., self.delays], q[..., self.owned :]
 
     def of(self, rows: np.ndarray) -> "Gains":
         """The gains of some of the rows."""
         delta = self.discrepancy and self.discrepancy.rows(rows)
-        of = {"frequency": self.frequency[rows], "discrepancy": delta}
-        return dataclasses.replace(self, **of, nodes=self.nodes and self.nodes.of(rows))
+        filters = self.filters and self.filters.rows(rows)
+        of = {"frequency": self.frequency[rows], "discrepancy": delta, "filters": filters}
+        return dataclasses.replace(self, **of)
 
     def at(self, index: np.ndarray) -> "Gains":
         """The same at some of the frequencies."""
         source, frequency = self.source.at(index), self.frequency[..., index]
         delta = self.discrepancy and self.discrepancy.at(index)
-        images = None if self.images is None else self.images[:, index]
-        of = {"source": source, "frequency": frequency, "discrepancy": delta, "images": images}
-        return dataclasses.replace(self, **of)
+        return dataclasses.replace(self, source=source, frequency=frequency, discrepancy=delta)
 
     def _departed(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
         """e^δ."""
         assert self.discrepancy is not None
         return namespace(q).exp(self.discrepancy(q[..., self.exact : self.owned]))
+
+    def of_states(self, q: Float[AnyArray, "*row q"], turn: AnyArray) -> AnyArray:
+        """What the channel of V_out makes of a state of the load, with these e^(−jωτ).
+
+        δ is an error of the channel, so that all of V_out has it.
+        """
+        first = turn[..., 0, :]
+        return first if self.discrepancy is None else first * self._departed(q)[..., 0, :]
+
+    def _corners(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row channel"]:
+        """Errors of the corners of the filters."""
+        return q[..., self.delays.stop : self.exact]
 
     def impedance(self, q: Float[AnyArray, "*row q"]) -> _Numbers:
         """Z_L [Ω]."""
@@ -226,15 +237,10 @@ class Gains:
         values = [value for value, *_ in self.outputs(at, current)]
         for of, size in faults:
             values[0] = values[0] * of.factor(place, size) + of.offset(place, size)
+        if self.filters is not None:
+            values[0] = values[0] * self.filters.error(self.frequency, self._corners(q))
         gains = along_outputs(values)
-        if self.images is not None and self.nodes is not None:
-            gains = gains + added(self.nodes.undelayed(self._at_nodes(q)), self.images)
         return gains if self.discrepancy is None else gains * self._departed(q)
-
-    def _at_nodes(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row q"]:
-        """The parameters without delays, and without δ."""
-        logs, delays, z = self.split(q)
-        return namespace(q).concatenate([logs, 0 * delays, z], -1)
 
     def slopes(self, q: Float[AnyArray, "*row q"]) -> Slopes:
         """The gains and their derivatives, at a few frequencies."""
@@ -270,22 +276,19 @@ class Gains:
             values = values * scale + first * offset[..., None, :] * turn
             by_at = by_at * (share * xp.ones_like(at))[..., None, :]
         unit, s = np.eye(self.outputs.count)[:, :, None], frequency_variable(self.frequency)
-        s = (s / self.sample_rate)[..., None, :]
-        by_delay = unit * (-s * values)[..., None, :, :]
+        by_delay = unit * ((-s / self.sample_rate)[..., None, :] * values)[..., None, :, :]
         of_w = by_source * loaded[..., None, :]
         by_z = self.source.w_by_z(z)[..., None, :] * of_w[..., None, :, :]
         if of_faults is not None and self.source.tolerances is not None:
             sizes = self.source.tolerances.faults_by_z[:, :, None, None]
             by_z = by_z + (sizes * of_faults[..., None, :, :, :]).sum(-3)
-        by_element = by_element[..., None, :] * by_at[..., None, :, :]
-        if self.images is not None and self.nodes is not None:
-            of = self.nodes.slopes(self._at_nodes(q))
-            late = added(of.gains, self.images) * turn
-            values, by_delay = values + late, by_delay - unit * (s * late)[..., None, :, :]
-            every = added(of.by_q, self.images) * turn[..., None, :, :]
-            by_element = by_element + every[..., : self.elements, :, :]
-            by_z = by_z + every[..., self.exact :, :, :]
-        own = [by_element, by_delay]
+        own = [by_element[..., None, :] * by_at[..., None, :, :], by_delay]
+        if self.filters is not None:  # V_out is the only output of a current
+            corners = self._corners(q)
+            by = self.filters.error(self.frequency, corners)[..., None, :]
+            of_corners = self.filters.slopes(self.frequency, corners)[..., None, :]
+            values, by_at = values * by, by_at * by
+            own = [*(of * by[..., None, :, :] for of in own), values[..., None, :, :] * of_corners]
         if self.discrepancy is not None:
             by = self._departed(q)
             values, by_at, by_source = values * by, by_at * by, by_source * by

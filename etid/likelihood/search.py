@@ -119,7 +119,8 @@ class Load:
         z, frequency = at_knots.impedance(q), self.gains.frequency
         degrees = orders(type(self.gains.circuit))
         of = relaxations(degrees, at_knots.frequency, z, frequency).values
-        states = self.transient.states(gains, self.gains.turn(q)[..., 0, :], of)
+        turn = self.gains.of_states(q, self.gains.turn(q))
+        states = self.transient.states(gains, turn, of)
         return Profile.of(records, gains, states), states
 
     def at_knots(self, q: Float[AnyArray, "*row q"], at_knots: Gains) -> Profile:
@@ -127,11 +128,12 @@ class Load:
         records = Records(*(each[..., self.knots.index] for each in self.known(q)))
         gains, states = at_knots.at_few(q), None
         if self.transient is not None:
-            f, turn = at_knots.frequency, at_knots.turn_at_few(at_knots.split(q)[1])
+            f = at_knots.frequency
+            turn = at_knots.of_states(q, at_knots.turn_at_few(at_knots.split(q)[1]))
             degrees = orders(type(self.gains.circuit))
             of = relaxations(degrees, f, at_knots.impedance(q), f).values
             transient = self.transient.at(self.knots.index)
-            states = transient.states(gains, turn[..., 0, :], of)
+            states = transient.states(gains, turn, of)
         return Profile.of(records, gains, states)
 
 
@@ -214,17 +216,21 @@ class Near(NamedTuple):
 def _states_by_q(
     load: Load, at_knots: Gains, q: Float[AnyArray, "*row q"], profile: Profile, slopes: Slopes
 ) -> Complex[AnyArray, "*row q output knot"]:
-    """∂/∂q of what the states make, at the same X − V: by the decays of the load, and its delay."""
+    """∂/∂q of what the states make, at the same X − V: by decays of the load, its delay, and δ."""
     assert load.transient is not None
     assert profile.states is not None
-    xp, count, e = namespace(q), load.transient.decays.shape[0], at_knots.elements
+    xp, count, e = namespace(q), load.transient.decays.shape[-2], at_knots.elements
     logs, delays, _ = at_knots.split(q)
     f, every = at_knots.frequency, load.gains.outputs.count
     z, by_element = with_slopes(load.gains.circuit, logs, f)
     of = relaxations(orders(type(load.gains.circuit)), f, z, f, by_element)
     p = profile.states[..., count : count + of.values.shape[-2]]
     whole = (as_complex(p)[..., None] * of.values).sum(-2)[..., None, :]
-    turn, first = at_knots.turn_at_few(delays)[..., :1, :], np.eye(every)[0][:, None]
+    turn = at_knots.of_states(q, at_knots.turn_at_few(delays))[..., None, :]
+    first = np.eye(every)[0][:, None]
+    passed = load.transient.passed
+    if passed is not None:  # V_out is the only output of a current
+        turn = turn * passed[..., None, load.knots.index]
     own = first * turn
     by_voltage = own - slopes.gains if load.transient.behind else own + 0 * slopes.gains
     moved = xp.zeros((*q.shape[:-1], e, f.shape[-1]), complex)
@@ -233,8 +239,31 @@ def _states_by_q(
     by_logs = moved[..., None, :] * by_voltage[..., None, :, :]
     s = frequency_variable(f / load.gains.sample_rate)[..., None, :]
     by_delay = (-s * whole * own)[..., None, :, :]
+    exact, delta = at_knots.exact, at_knots.discrepancy
     rest = xp.zeros((*q.shape[:-1], q.shape[-1] - e - 1, every, f.shape[-1]), complex)
-    return xp.concatenate([by_logs, by_delay, rest], -3)
+    if delta is None:
+        return xp.concatenate([by_logs, by_delay, rest], -3)
+    by_delta = delta.by_coefficient(every) * (whole * own)[..., None, :, :]
+    rest = rest[..., : exact - e - 1, :, :], by_delta, rest[..., at_knots.owned - e - 1 :, :, :]
+    return xp.concatenate([by_logs, by_delay, *rest], -3)
+
+
+def of_load(load: Load, near: "Near") -> Complex[AnyArray, "*row output knot"] | None:
+    """What the states of the load make of the outputs at the knots; None without states."""
+    if load.transient is None:
+        return None
+    assert near.profile.states is not None
+    at_knots = load.gains.at(load.knots.index)
+    count, every = load.transient.decays.shape[-2], load.gains.outputs.count
+    f, delays = at_knots.frequency, at_knots.split(near.q)[1]
+    z = at_knots.impedance(near.q)
+    of = relaxations(orders(type(load.gains.circuit)), f, z, f).values
+    p = near.profile.states[..., count : count + of.shape[-2]]
+    turn = at_knots.of_states(near.q, at_knots.turn_at_few(delays))
+    if load.transient.passed is not None:
+        turn = turn * load.transient.passed[..., load.knots.index]
+    whole = (as_complex(p)[..., None] * of).sum(-2) * turn
+    return np.eye(every)[0][:, None] * whole[..., None, :]
 
 
 def _equations(
@@ -390,7 +419,7 @@ def _search(
 ) -> Minimum:
     xp, at_knots = namespace(starts), load.gains.at(load.knots.index)
     place = np.arange(starts.shape[-1])
-    delays = (place >= load.gains.elements) & (place < load.gains.exact)
+    delays = (place >= load.gains.delays.start) & (place < load.gains.delays.stop)
 
     def step(load: Load, at_knots: Gains, state: _State) -> _State:
         near = Near.of(load, at_knots, state.trial)

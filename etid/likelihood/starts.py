@@ -90,10 +90,10 @@ def _by_harmonics(load: Load) -> Float[AnyArray, "start *row own"]:
         found = xp.log(xp.where(usable[..., None], factors, 1.0))
         logs = typical + found[..., :1] * level + found[..., 1:] * time
     late = coefficients[..., 3:] / RATE * load.gains.sample_rate
-    rest = xp.zeros((*late.shape[:-1], load.gains.outputs.count - 1))
+    rest = xp.zeros((*late.shape[:-1], load.gains.exact - load.gains.elements - 1))
     first = xp.concatenate([logs, late, rest], -1)
     others = [typical + np.log(factor) * level for factor in LEVELS]
-    delays = np.zeros(load.gains.outputs.count)
+    delays = np.zeros(load.gains.exact - load.gains.elements)
     others = [xp.zeros_like(first) + xp.concatenate([one, delays]) for one in others]
     return xp.stack([first, *others[::-1]])
 
@@ -124,8 +124,8 @@ def _by_current(
     z = impedance_at(circuit, logs, every.at(load.gains.frequency))
     off = (weight * size).sum(-1) - 0.5 * (every.summed(weight) * xp.log(power(z))).sum(-1)
     level = (off / weight.sum(-1))[..., None] * by_size
-    delays = xp.zeros((*own, load.gains.outputs.count))
-    return xp.concatenate([logs + level, delays], -1)[::-1]
+    rest = xp.zeros((*own, load.gains.exact - load.gains.elements))
+    return xp.concatenate([logs + level, rest], -1)[::-1]
 
 
 def _steiglitz_mcbride(load: Load) -> Float[AnyArray, "*row coefficient"]:

@@ -22,6 +22,9 @@ For other loads ψ are relaxations with fixed rates, `PER_DECADE` of them.
 `LARGEST` times the effective value of the record. This weak prior keeps the states finite whose
 effects on the record cancel.
 
+**An error of the gain** (`etid.likelihood.discrepancy`) multiplies all of V_out by e^δ, Ψ too. What
+δ does to the state of its own channel at the ends of a record is of second order, or at rest there.
+
 **Ends.** The samples beside the ends have no neighbours on one side, so that aliases of the cut are
 in the record. They are smooth in frequency: polynomials of s stand for them. The offset of a record
 is its mean, so that bin 0 tells nothing.
@@ -41,6 +44,7 @@ from etid.likelihood.linear import inverse
 from etid.likelihood.profile import States
 from etid.precision import namespace
 from etid.signals.harmonics import real_parts
+from etid.signals.low_pass import Filters
 from etid.signals.transfer import AnyArray, as_complex, frequency_variable, power, reciprocal
 
 ENDS = 4  # polynomials; with 2 to 12 of them estimates and errors are the same
@@ -62,6 +66,11 @@ def ends(bins: int) -> Complex[np.ndarray, "end bin"]:
     """What the ends of a record add to an output, at its first bins without bin 0."""
     place = np.arange(1.0, bins + 1) / bins
     return np.stack([(1j * place) ** power for power in range(ENDS)])
+
+
+def _channels(of: AnyArray, axis: int = -2) -> list[AnyArray]:
+    """Values of V_out and of the current."""
+    return [namespace(of).take(of, row, axis) for row in range(2)]
 
 
 class Relaxations(NamedTuple):
@@ -86,20 +95,55 @@ class Transient:
         ends: What the ends of the record add to each output.
         width: Prior standard deviation of a state.
         behind: Whether the load is behind a source, whose current its states change.
+        passed: What filters make of the states of the load; None without filters.
     """
 
-    decays: Complex[AnyArray, "decay bin"]
-    ends: Complex[AnyArray, "end bin"]
+    decays: Complex[AnyArray, "*row_or_not decay bin"]
+    ends: Complex[AnyArray, "*row_or_not end bin"]
     width: Float[AnyArray, "*row output"]
     behind: bool = dataclasses.field(default=True, metadata={"static": True})
+    passed: Complex[AnyArray, "*row bin"] | None = None
+
+    def filtered(
+        self,
+        filters: Filters,
+        frequency: Float[AnyArray, "*row bin"],
+        of_x: Float[AnyArray, "*row"],
+    ) -> "Transient":
+        """The same of a current and V_out with known filters, whose states are unknown, too.
+
+        Both records have passed both filters, so that with the decays φ of each filter
+
+            V_out = G (X − H_v Σ p φ_i) + H_v H_i Ψ + H_i Σ p φ_v.
+
+        `of_x` is the `width_of` of the current, which is not that of V_out.
+        """
+        xp = namespace(self.width)
+        of_v_out, of_current = (one[..., None, :] for one in _channels(filters(frequency)))
+        by_v_out, by_current = _channels(filters.decays(frequency), axis=-3)
+        unit = frequency[..., :1, None] * as_complex(of_x / self.width[..., 0])[..., None, None]
+        more = of_current * by_v_out * frequency[..., :1, None]
+        rest = self.ends + xp.zeros((*more.shape[:-2], 1, 1))
+        return dataclasses.replace(
+            self,
+            decays=of_v_out * by_current * unit,
+            ends=xp.concatenate([rest, more], -2),
+            passed=(of_v_out * of_current)[..., 0, :],
+        )
 
     def of(self, rows: np.ndarray) -> "Transient":
         """Those of some of the rows."""
-        return dataclasses.replace(self, width=self.width[rows])
+        width = self.width[rows]
+        if self.passed is None:
+            return dataclasses.replace(self, width=width)
+        of = {"decays": self.decays[rows], "ends": self.ends[rows], "passed": self.passed[rows]}
+        return dataclasses.replace(self, width=width, **of)
 
     def at(self, index: np.ndarray) -> "Transient":
         """The same at some of the bins."""
-        return dataclasses.replace(self, decays=self.decays[:, index], ends=self.ends[:, index])
+        passed = None if self.passed is None else self.passed[..., index]
+        of = {"decays": self.decays[..., index], "ends": self.ends[..., index]}
+        return dataclasses.replace(self, passed=passed, **of)
 
     def states(
         self,
@@ -109,6 +153,8 @@ class Transient:
     ) -> States:
         """The states of records with these gains; `turn` is e^(−jωτ) of V_out."""
         xp, outputs = namespace(gains), gains.shape[-2]
+        if self.passed is not None:
+            relaxations = relaxations * self.passed[..., None, :]
         decays = self.decays + xp.zeros((*relaxations.shape[:-2], 1, 1))
         none = -relaxations if self.behind else 0 * relaxations
         inputs = xp.concatenate([-decays, none], -2)[..., None, :]
@@ -117,11 +163,12 @@ class Transient:
         own = first * (relaxations * turn[..., None, :])[..., None, :]
         count = decays.shape[-2]
         made = xp.concatenate([made[..., :count, :, :], made[..., count:, :, :] + own], -3)
-        of_ends = (np.eye(outputs)[:, None, :, None] * self.ends[:, None, :]).reshape(
-            -1, outputs, self.ends.shape[-1]
-        ) + xp.zeros((*made.shape[:-3], 1, 1, 1))
+        rows, bins = self.ends.shape[:-2], self.ends.shape[-1]
+        of_ends = np.eye(outputs)[:, None, :, None] * self.ends[..., None, :, None, :]
+        of_ends = of_ends.reshape(*rows, -1, outputs, bins)
+        of_ends = of_ends + xp.zeros((*made.shape[:-3], 1, 1, 1))
         first = self.width[..., :1] * np.ones(inputs.shape[-3])
-        each = xp.concatenate([first, xp.repeat(self.width, self.ends.shape[0], -1)], -1)
+        each = xp.concatenate([first, xp.repeat(self.width, self.ends.shape[-2], -1)], -1)
         width = each + xp.zeros((*made.shape[:-3], 1))
         return States(inputs, xp.concatenate([made, of_ends], -3), width)
 

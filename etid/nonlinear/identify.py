@@ -16,7 +16,14 @@ from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.rows import source_of
 from etid.estimators.maximum_likelihood.verdict import ACCEPT, judged
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
-from etid.identify.arguments import check_alike, check_distinct, circuit_of, driver_of, fed
+from etid.identify.arguments import (
+    check_alike,
+    check_distinct,
+    check_no_filters,
+    circuit_of,
+    driver_of,
+    fed,
+)
 from etid.identify.arguments import recordings as list_of
 from etid.identify.fitting import known_of, remarks_on
 from etid.identify.options import Interval, Options, plan
@@ -117,8 +124,8 @@ def identify_amplitudes(
         RecordingError: There is no recording, one is given twice, the recordings have different
             lengths or rates, they lack V_th or the current, or all have one amplitude and the load
             depends on its current.
-        ValueError: The driver was identified by another method, the circuit has several resistors
-            that depend on their current, or a converter holds the command of a recording.
+        ValueError: The driver was identified by another method, or the circuit has several
+            resistors that depend on their current.
         IdentificationError: The result cannot be used and `throw` is set.
     """
     driver = driver_of(driver)
@@ -134,14 +141,11 @@ def identify_amplitudes(
     of = list_of("recordings", recordings)
     check_alike("recordings", of)
     fed_by = [fed(one, driver)[0] for one in of]
+    for one in fed_by:
+        check_no_filters(one, "a fit of several amplitudes")
     check_distinct("recordings", of)
     seen = [Inspected.of(one) for one in fed_by]
     for one in seen:
-        if one.is_held:
-            raise ValueError(
-                f"recording {one.recording.path!r}: several amplitudes are not fitted behind a "
-                "command that a converter holds; identify each recording alone"
-            )
         _, name = plan(options, one, feed)
         if name is not None:
             fit = failed_fit(name, options, METHOD)

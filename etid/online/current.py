@@ -12,9 +12,10 @@ over bands.
 
 **Errors.** The tracker knows the gain G of the pulses better than the elements and Z_th apart. With
 G fixed, I = X (1 − G) / Z_th: an error δ log Z_th of the calibration makes an error −I δ log Z_th
-of the current. A gain g and a crosstalk κ of the instrument change the measured G by g G + κ, and
-so the current by I (g G + κ) / (1 − G); a capacitance C across the skin takes −I s C Z_L of it. The
-noise of the pulses adds ∂I/∂ϑ = −X Y² ∂Z_L/∂ϑ, with Y = 1/(Z_L + Z_th).
+of the current. A circuit that is not exact, and a gain g and a crosstalk κ of the instrument,
+change the measured G by δ G + g G + κ, and so the current by I (δ G + g G + κ) / (1 − G); a
+capacitance C across the skin takes −I s C Z_L of it. The noise of the pulses adds
+∂I/∂ϑ = −X Y² ∂Z_L/∂ϑ, with Y = 1/(Z_L + Z_th).
 
 The unloaded record has the bandwidth of its converter. A spike at an edge that is shorter than two
 samples is higher than its peak here.
@@ -29,7 +30,7 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.online.pulse_fit import GainModel, first_largest
 from etid.precision import Module
-from etid.signals.transfer import frequency_variable, reciprocal
+from etid.signals.transfer import as_complex, frequency_variable, power, reciprocal
 
 EDGE = 24  # [samples] after each edge that are looked at in steps of half a sample
 
@@ -58,6 +59,7 @@ class CurrentModel(Module):
         source: Z_th in each band [Ω].
         source_error: Errors of log Z_th by the calibrations, as in `GainModel`.
         faults: Errors of the instrument, as in `GainModel`.
+        discrepancy: Functions of δ, as in `GainModel`.
         sums: Weights w of the admittance in Re Σ w Y: row 0 for the charge [C Ω], the others for
             the current at times that are dense at the edges [A Ω].
         phase: Duration of a phase, t₁ − t₀ [s].
@@ -68,6 +70,7 @@ class CurrentModel(Module):
     source: Complex[Array, " band"]
     source_error: Complex[Array, "z band"]
     faults: Float[Array, "z 3"] | None
+    discrepancy: Float[Array, "function band"] | None
     sums: Complex[Array, "row band"]
     phase: float = eqx.field(static=True)
     rest: float = eqx.field(static=True)
@@ -95,6 +98,7 @@ class CurrentModel(Module):
             frequency=bands.frequency,
             source=pulses.source,
             source_error=pulses.source_error,
+            discrepancy=pulses.discrepancy,
             faults=pulses.faults,
             sums=jnp.asarray(rows @ np.stack(weights, axis=1)),
             phase=float((end - begin) / rate),
@@ -140,15 +144,17 @@ class CurrentModel(Module):
         # The rows times Y, not the derivatives: all electrodes have the same `source_error`.
         rows = rows * admittance[None, :]
         charge, peak = rows.real.sum(axis=1)
-        shared = _real(rows, self.source_error.T)
+        shared, ratio = _real(rows, self.source_error.T), z * reciprocal(self.source)
         if self.faults is not None:
-            ratio = z * reciprocal(self.source)
             direct = jnp.stack([ratio, 1 + ratio, -frequency_variable(self.frequency) * z])
             shared = shared - _real(rows, direct.T) @ self.faults.T
         # Re Σ row Y² ∂Z/∂ϑ
         (own,) = jax.vmap(pulled)(rows * admittance[None, :])
         variance = jnp.sum((own @ cov) * own, axis=1)
         variance = variance + jnp.sum(shared**2, axis=1)
+        if self.discrepancy is not None:
+            by_delta = (rows * ratio[None, :]) @ as_complex(self.discrepancy.T)
+            variance = variance + jnp.sum(power(by_delta), axis=1)
         charge_stderr, peak_stderr = jnp.sqrt(variance)
         return Current(charge, charge_stderr, jnp.abs(peak), peak_stderr)
 

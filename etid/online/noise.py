@@ -7,6 +7,7 @@ this pulse and at the one before, each in standard deviations, it follows
 
     |e − e⁻|² / 4.
 
+What a circuit that is not exact leaves is the same in both (`etid.online.discrepancy`).
 The part of a residual that a gain or another circuit explains (`etid.online.alarms`) is taken out
 before. What does not change is the model's, too: the difference does not hide it. Hum that is
 locked to the pulses, such as 60 Hz with pulses of 60 Hz, does not change, either. Up to the seventh
@@ -47,7 +48,8 @@ class Noise(Module):
     Attributes:
         bands: Variance in each band, relative to that in the quiet between two pulses.
         line: Deviation h of each line of the mains between the harmonics [V].
-        residual: Residual of the last pulse in standard deviations; NaN if it shows nothing.
+        residual: Residual of the last pulse in standard deviations, with what the circuit leaves;
+            NaN if it shows nothing.
         pulses: Number of pulses that have shown the noise in the bands.
         least: Least deviation of a line [V].
     """
@@ -80,6 +82,7 @@ class Noise(Module):
         self,
         hum: Bool[Array, " band"],
         residual: Float[Array, " part"],
+        rough: Float[Array, " part"],
         patterns: Float[Array, "pattern part"],
         shown: Bool[Array, ""],
     ) -> "Noise":
@@ -88,6 +91,7 @@ class Noise(Module):
         Args:
             hum: Bands where hum may be.
             residual: Residual of the pulse, cleared, in standard deviations.
+            rough: The same, with what the circuit leaves.
             patterns: Cosine and sine of each line, cleared as the residual.
             shown: Whether the pulse shows the noise.
         """
@@ -95,7 +99,7 @@ class Noise(Module):
         fitted = (patterns @ residual) / size
         own, change, rest = (
             jnp.sum(of.reshape(2, -1) ** 2, axis=0)
-            for of in (residual, residual - self.residual, residual - fitted @ patterns)
+            for of in (residual, rough - self.residual, residual - fitted @ patterns)
         )
         # A residual that is everywhere is the model's.
         elsewhere = (
@@ -118,7 +122,7 @@ class Noise(Module):
         return Noise(
             bands=bands,
             line=jnp.where(shown & jnp.isfinite(lines), lines, self.line),
-            residual=jnp.where(shown, residual, jnp.nan),
+            residual=jnp.where(shown, rough, jnp.nan),
             pulses=self.pulses + jnp.where(shown, 1.0, 0.0),
             least=self.least,
         )

@@ -22,6 +22,7 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import source_of
 from etid.estimators.unknowns import LoadUnknowns
 from etid.likelihood.source_prior import DELAY_WIDTH
+from etid.online.discrepancy import Smooth, functions
 from etid.online.gain_bands import Bands
 from etid.online.noise import cleared
 from etid.precision import Module, array_function, namespace
@@ -80,6 +81,7 @@ class GainModel(Module):
             deviation of 1.
         faults: Gain, crosstalk and capacitance of the instrument by the same errors; None if it has
             no tolerances.
+        discrepancy: Functions of the error δ of a circuit that is not exact; None if it is.
     """
 
     circuit: AbstractCircuit
@@ -91,6 +93,7 @@ class GainModel(Module):
     noise_freedom: Float[AnyArray, ""]
     source_error: Complex[AnyArray, "z band"]
     faults: Float[AnyArray, "z 3"] | None = None
+    discrepancy: Float[AnyArray, "function band"] | None = None
 
     @classmethod
     def of(
@@ -100,8 +103,18 @@ class GainModel(Module):
         known: GivenDriver,
         source_alias: Complex[Array, " band"],
         noise_freedom: int,
+        discrepancy: float,
     ) -> "GainModel":
-        """The model of loads behind the driver `known`, with the phases of all `DELAYS`."""
+        """The model of loads behind the driver `known`, with the phases of all `DELAYS`.
+
+        Args:
+            circuit: Structure of the loads.
+            bands: The unloaded pulse and its bands.
+            known: The driver in these bands.
+            source_alias: Z_th at the frequency from which the aliases of a band come [Ω].
+            noise_freedom: Degrees of freedom of the variance of the noise.
+            discrepancy: Standard deviation of the real and of the imaginary part of δ.
+        """
         loaded = source_of(known).z_loaded(combined(known.mean, known.slope))
         source = loaded - as_complex(known.resistance)
         turn = 2 * jnp.pi * bands.frequency / bands.sample_rate
@@ -111,27 +124,57 @@ class GainModel(Module):
         independent = root(known.cov).T
         error = combined(independent, by_source)
         faults = None if known.faults is None else independent @ known.faults[1]
-        return cls(circuit, bands, source, source_alias, turn, turns, freedom, error, faults)
+        of = circuit, bands, source, source_alias, turn, turns, freedom, error, faults
+        return cls(*of, jnp.asarray(functions(bands, discrepancy)) if discrepancy else None)
 
     def errors_along(
         self, gain: Complex[Array, " band"], weights: Complex[Array, "value band"]
-    ) -> Float[Array, "value z"]:
+    ) -> Float[Array, "value error"]:
         """Re Σ conj(w) `by_error`; all electrodes have the same errors, one matrix product."""
         by_source = real_parts(jnp.conj(gain * (gain - 1))[None, :] * weights)
-        found = by_source @ real_parts(self.source_error).T
-        if self.faults is None:
+        found, weights = by_source @ real_parts(self.source_error).T, real_parts(weights)
+        if self.faults is not None:
+            found = found + weights @ real_parts(self._by_fault(gain)).T @ self.faults.T
+        if self.discrepancy is None:
             return found
-        by_fault = real_parts(self._by_fault(gain))
-        return found + real_parts(weights) @ by_fault.T @ self.faults.T
+        return jnp.concatenate([found, weights @ real_parts(self._by_delta(gain)).T], 1)
 
-    def by_error(self, gain: Complex[AnyArray, "*row band"]) -> Complex[AnyArray, "*row z band"]:
-        """Changes of a gain by each independent error of calibrations and instrument."""
+    def by_error(
+        self, gain: Complex[AnyArray, "*row band"]
+    ) -> Complex[AnyArray, "*row error band"]:
+        """Changes of a gain by each independent error of calibrations, instrument and circuit."""
         # ∂G/∂ log Z_th = −G (1 − G)
         found = (gain * (gain - 1))[..., None, :] * self.source_error
-        if self.faults is None:
+        if self.faults is not None:
+            by_fault = self._by_fault(gain)
+            found = found + from_parts(self.faults @ by_fault.real, self.faults @ by_fault.imag)
+        if self.discrepancy is None:
             return found
-        by_fault = self._by_fault(gain)
-        return found + from_parts(self.faults @ by_fault.real, self.faults @ by_fault.imag)
+        return namespace(gain).concatenate([found, self._by_delta(gain)], -2)
+
+    def _by_delta(
+        self, gain: Complex[AnyArray, "*row band"]
+    ) -> Complex[AnyArray, "*row coefficient band"]:
+        """Changes of a gain by each coefficient of δ, of its real and of its imaginary part."""
+        real = gain[..., None, :] * as_complex(self.discrepancy)
+        return namespace(gain).concatenate([real, 1j * real], -2)
+
+    def smooth(
+        self,
+        gain: Complex[AnyArray, "*row band"],
+        delay: Float[AnyArray, "*row"],
+        weight: Float[AnyArray, "*row band"],
+    ) -> Smooth | None:
+        """What makes parts of variance 1 of noise and δ in the residual of a delayed pulse.
+
+        Args:
+            gain: Measured gain.
+            delay: Delay [samples].
+            weight: Weight of |Ĝ − G|² in each band.
+        """
+        if self.discrepancy is None:
+            return None
+        return Smooth.of(self.discrepancy, gain * self.turned(delay), weight)
 
     @array_function
     def _by_fault(self, gain: Complex[AnyArray, "*row band"]) -> Complex[AnyArray, "*row 3 band"]:
@@ -181,6 +224,7 @@ class GainModel(Module):
         delay: Float[AnyArray, "*row"],
         weight: Float[AnyArray, "*row band"],
         line: Float[AnyArray, "*row line"],
+        smooth: Smooth | None,
     ) -> Float[AnyArray, "*row pattern part"]:
         """Lines of the mains in the residual of a delayed pulse [standard deviations].
 
@@ -188,11 +232,13 @@ class GainModel(Module):
             delay: Delay [samples].
             weight: Weight of |Ĝ − G|² in each band.
             line: Deviation of each line, for a pulse of the amplitude of the unloaded record [V].
+            smooth: What else the residual is multiplied by.
         """
         xp = namespace(weight, line)
         scale = self.turned(delay) * as_complex(xp.sqrt(weight))
         deviation = xp.repeat(line, 2, axis=-1)[..., None]
-        return real_parts(self.bands.lines * scale[..., None, :]) * deviation
+        lines = self.bands.lines * scale[..., None, :]
+        return real_parts(lines if smooth is None else smooth(lines)) * deviation
 
     def undelayed(self, logs: Float[AnyArray, "*row element"]) -> Complex[AnyArray, "*row band"]:
         """The gain without a delay."""
@@ -343,6 +389,7 @@ class Pulse(Module):
         centre: Logarithms of the elements before the pulse [SI].
         information: Inverse covariance of `centre`.
         lines: Lines of the mains of which the residual is cleared (`etid.online.noise`).
+        smooth: What makes parts of variance 1 of noise and δ; None without δ.
     """
 
     model: GainModel
@@ -351,20 +398,25 @@ class Pulse(Module):
     centre: Float[AnyArray, "*row element"]
     information: Float[AnyArray, "*row element element"]
     lines: Float[AnyArray, "*row pattern part"]
+    smooth: Smooth | None
 
     def whitened(
         self, gains: Complex[AnyArray, "*row value band"]
     ) -> Float[AnyArray, "*row value part"]:
         """Gains in standard deviations of the noise."""
         root = as_complex(namespace(self.weight).sqrt(self.weight))
-        return cleared(real_parts(gains * root[..., None, :]), self.lines)
+        values = gains * root[..., None, :]
+        values = values if self.smooth is None else self.smooth(values)
+        return cleared(real_parts(values), self.lines)
 
     def errors_along(
         self, gain: Complex[Array, " band"], directions: Float[Array, "value part"]
-    ) -> Float[Array, "value z"]:
+    ) -> Float[Array, "value error"]:
         """Components of the independent errors of the gain along directions of the residual."""
         parts = jnp.split(cleared(directions, self.lines[::-1]), 2, axis=1)
-        weights = jax.lax.complex(*parts) * as_complex(jnp.sqrt(self.weight))[None, :]
+        weights = jax.lax.complex(*parts)
+        weights = weights if self.smooth is None else self.smooth.transposed(weights)
+        weights = weights * as_complex(jnp.sqrt(self.weight))[None, :]
         return self.model.errors_along(gain, weights)
 
     def by_x(self, gain: Complex[AnyArray, "*row band"]) -> Float[AnyArray, "*row part"]:

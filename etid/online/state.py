@@ -177,8 +177,9 @@ def fits_of(
     expected = model.expected(logs)
     nothing = np.zeros((lanes, elements, elements))
     weight = bands.weight / state.variance[:, None] / noise.bands
-    lines = directions(model.patterns(np.zeros(lanes), weight, noise.line))
-    pulse = Pulse(model, np.zeros_like(expected.gain), weight, logs, nothing, lines)
+    smooth = model.smooth(expected.gain, np.zeros(lanes), weight)
+    lines = directions(model.patterns(np.zeros(lanes), weight, noise.line, smooth))
+    pulse = Pulse(model, np.zeros_like(expected.gain), weight, logs, nothing, lines, smooth)
     jacobian = pulse.jacobian(expected)
     by_term = inverse(jacobian @ jacobian.swapaxes(-1, -2))[:, :elements] @ jacobian
     of_source = by_term @ pulse.whitened(model.by_error(expected.gain)).swapaxes(-1, -2)
@@ -198,7 +199,7 @@ def fits_of(
             np.full(lanes, driver_changed),
         ],
         ["insensitive", "driver_failed", "inconsistent"],
-        "successful",
+        "successful" if model.discrepancy is None else "approximate",
     )
     names = verdict_names(state.result)
     return Fit(

@@ -17,6 +17,7 @@ from etid.estimators.starts import circuit_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.likelihood.noise import misses
 from etid.online.alarms import Innovation, PulseScores, averaged, driver_change
+from etid.online.discrepancy import Smooth
 from etid.online.gain_bands import Bands
 from etid.online.noise import Noise, cleared, directions
 from etid.online.projection import BandSums
@@ -33,6 +34,7 @@ from etid.online.pulse_fit import (
 )
 from etid.online.state import DRIFT, JUMP, NONE, OPEN, REPEATED, ElectrodeState
 from etid.results.verdicts import RESULTS, first_verdict
+from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, power
 from etid.solvers.matrices import inverse_of_few, root_of_few
 
@@ -82,6 +84,7 @@ class Attempt(NamedTuple):
         residual: Residual of the pulse that no gain and no spread explains, of variance 1 if the
             noise is as expected.
         lines: Lines of the mains, as the residual.
+        rough: The residual with what δ makes of it, which is the same in each pulse.
     """
 
     own: Float[Array, "*lane own"]
@@ -93,6 +96,7 @@ class Attempt(NamedTuple):
     scores: PulseScores
     residual: Float[Array, "*lane part"]
     lines: Float[Array, "*lane pattern part"]
+    rough: Float[Array, "*lane part"]
 
 
 class Suspicion(NamedTuple):
@@ -169,7 +173,7 @@ def updated(
         known = jax.vmap(partial(noise_after, model.bands.hum))(noise, measured, found)
         other = measured_pulse(model.bands, sums, amplitude, before, known)
         fit = jax.vmap(tracked)(logs, other, expected, information)
-        known = dataclasses.replace(known, residual=fit.residual)
+        known = dataclasses.replace(known, residual=fit.rough)
         fits = ~suspect(before, fit, information).jump
         better = running & fits & (found.result == RESULTS.misfit)
         return jax.vmap(lambda which, *of: jax.tree.map(partial(jnp.where, which), *of))(
@@ -290,9 +294,10 @@ def attempt(
 ) -> Attempt:
     """The fit of a pulse from a start near its minimum."""
     gain = measured.gain - model.departure(expected, start.delay_samples)
-    patterns = model.patterns(start.delay_samples, measured.weight, measured.line)
+    smooth = model.smooth(gain, start.delay_samples, measured.weight)
+    patterns = model.patterns(start.delay_samples, measured.weight, measured.line, smooth)
     lines = directions(patterns)
-    pulse = Pulse(model, gain, measured.weight, centre, information, lines)
+    pulse = Pulse(model, gain, measured.weight, centre, information, lines, smooth)
     own, at, decrement, residual = minimum(pulse, start, expected)
     weight = measured.weight
     freedom = 2 * jnp.sum(weight > 0, dtype=at.squares.dtype) - own.size
@@ -316,6 +321,10 @@ def attempt(
     # What the parameters do not take of the noise in each part.
     jacobian = pulse.jacobian(expected)
     left = 1 - jnp.sum((inverse_of_few(at.matrix) @ jacobian) * jacobian, axis=0)
+    rough = unexplained = unexplained / jnp.sqrt(left)
+    if smooth is not None:
+        parts = jax.lax.complex(*jnp.split(unexplained, 2))
+        rough = real_parts(smooth.undone(parts[None]))[0]
     return Attempt(
         own,
         told,
@@ -324,8 +333,9 @@ def attempt(
         rrse,
         result,
         scores,
-        unexplained / jnp.sqrt(left),
+        unexplained,
         cleared(patterns, lines),
+        rough,
     )
 
 
@@ -350,28 +360,45 @@ def anew(
     delays, distances = jax.vmap(lambda one: nearest_delay(model, measured.gain, one))(gains)
     # `argmin` would take a start without a number: a search that diverged would never end.
     number = jnp.argmin(jnp.where(jnp.isfinite(distances), distances, jnp.inf))
-    start, delay = logs[number], delays[number]
-    lines = directions(model.patterns(delay, measured.weight, measured.line))
+    start, delay, weight = logs[number], delays[number], measured.weight
     nothing = jnp.zeros((starts.shape[1], starts.shape[1]))
 
     # With the departure of each step: that of a distant start moves the minimum by several standard
     # errors, out of reach of the two steps that follow.
-    def equations(q: Float[Array, " own"]) -> Equations:
+    def equations(
+        weight: Float[Array, " band"],
+        smooth: Smooth | None,
+        lines: Float[Array, "pattern part"],
+        q: Float[Array, " own"],
+    ) -> Equations:
         own = LoadUnknowns.of(q)
         expected = model.expected(own.log_elements)
         gain = measured.gain - model.departure(expected, own.delay_samples)
-        pulse = Pulse(model, gain, measured.weight, start, nothing, lines)
+        pulse = Pulse(model, gain, weight, start, nothing, lines, smooth)
         residual = pulse.residual(expected.gain, own.delay_samples)
         return pulse.equations(own, pulse.jacobian(expected), residual)
 
-    own = LoadUnknowns.of(searched(equations, LoadUnknowns(start, delay).vector(), wanted))
+    def reached(
+        weight: Float[Array, " band"], smooth: Smooth | None, own: LoadUnknowns
+    ) -> LoadUnknowns:
+        lines = directions(model.patterns(delay, weight, measured.line, smooth))
+        of = partial(equations, weight, smooth, lines)
+        return LoadUnknowns.of(searched(of, own.vector(), wanted))
+
+    own = LoadUnknowns(start, delay)
+    if model.discrepancy is None:
+        own = reached(weight, None, own)
+    else:
+        # Far away, where the residual is large, a smooth δ would explain nearly all of it. A δ that
+        # is another one in each band leads near the minimum.
+        squares = jnp.sum(model.discrepancy**2, axis=0) * power(measured.gain)
+        own = reached(weight / (1 + 2 * weight * squares), None, own)
+        own = reached(weight, model.smooth(measured.gain, own.delay_samples, weight), own)
     expected = model.expected(own.log_elements)
-    found = attempt(model, measured, own, expected, own.log_elements, nothing)
-    unknown = ~jnp.all(jnp.diagonal(found.spread) < 1)
-    result = first_verdict(
-        (found.result != SUCCESSFUL, found.result), (unknown, RESULTS.insensitive)
-    )
-    return found._replace(result=result)
+    fit = attempt(model, measured, own, expected, own.log_elements, nothing)
+    unknown = ~jnp.all(jnp.diagonal(fit.spread) < 1)
+    result = first_verdict((fit.result != SUCCESSFUL, fit.result), (unknown, RESULTS.insensitive))
+    return fit._replace(result=result)
 
 
 def noise_after(
@@ -380,7 +407,7 @@ def noise_after(
     """Noise at one electrode after one pulse."""
     settled = (used.result == SUCCESSFUL) | (used.result == RESULTS.misfit)
     shown = settled & measured.steady & jnp.isfinite(used.residual).all()
-    return noise.after(hum, used.residual, used.lines, shown)
+    return noise.after(hum, used.residual, used.rough, used.lines, shown)
 
 
 def turned(

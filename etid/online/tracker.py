@@ -33,6 +33,9 @@ several such pulses in a row, and at once if it touches nothing.
 **Amplitude.** V_out is divided by the amplitude of its pulse, relative to that of the unloaded
 record. The driver is linear. `etid.online.alarms` says when the gain or the amplitude is wrong.
 
+**A circuit that is not exact** is a misfit at every pulse, unless the tracker is told what the
+circuit leaves (`etid.online.discrepancy`).
+
 Z_th comes from the calibrations only; the pulses change neither it nor errors of the instrument.
 More pulses reduce none of these errors, nor that from the noise of the unloaded record: all are in
 `shared_cov`. Calibrate with two resistors. One resistor leaves a delay open, which makes an error
@@ -48,7 +51,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit, impedance_at
-from etid.circuits.display import several
+from etid.circuits.display import per_cent, several
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
@@ -87,7 +90,8 @@ NOTES = {
     "too_short": "No pulse was identified yet; the elements are typical values, not estimates.",
     "max_steps_reached": "No load of this circuit gives this pulse. Does the window begin between "
     "two pulses, is `amplitude` that of the pulse, and is v_out in volt at the terminal?",
-    "misfit": f"{message('misfit')} Is `amplitude` that of the pulse, and the gain of v_out right?",
+    "misfit": f"{message('misfit')} Is `amplitude` that of the pulse, and the gain of v_out right? "
+    "If a fit of a record of this skin is `approximate`, give the tracker its `discrepancy`.",
 }
 
 
@@ -108,6 +112,7 @@ class Tracker(Overviewed, Kept):
         electrodes: Number of electrodes.
         period: Length of a period [samples].
         line: Standard error of the amplitude of a line of the mains in one pulse [V].
+        discrepancy: What the circuit leaves of the signal, as it was given.
     """
 
     model: GainModel
@@ -119,6 +124,7 @@ class Tracker(Overviewed, Kept):
     electrodes: int
     period: float
     line: float
+    discrepancy: float
 
     @classmethod
     @in_float64
@@ -130,6 +136,7 @@ class Tracker(Overviewed, Kept):
         electrodes: int,
         circuit: AbstractCircuit | str | None = None,
         change: float = 0.0,
+        discrepancy: float = 0.0,
     ) -> "Tracker":
         """A tracker for one driver.
 
@@ -142,6 +149,10 @@ class Tracker(Overviewed, Kept):
             circuit: As in `identify_skin`, without `"auto"`.
             change: Standard deviation of the change of the elements' logarithms from pulse to pulse
                 (a random walk) [1/√pulse]; 0 for elements that do not change.
+            discrepancy: What the circuit leaves of the signal, as an `approximate` fit of such a
+                load says (`Fit.leaves`), such as 0.005; 0 for a circuit that is exact. It is the
+                standard deviation of the real and of the imaginary part of a smooth relative error
+                of the gain. Verdicts are then `approximate`, and ± contain it.
 
         Returns:
             The tracker. It does not change; its states hold the estimates.
@@ -162,6 +173,12 @@ class Tracker(Overviewed, Kept):
         change = number_of("change", change)
         if not (np.isfinite(change) and change >= 0):
             raise ValueError(f"change is {change}; it must be finite and not negative")
+        discrepancy = number_of("discrepancy", discrepancy)
+        if not 0 <= discrepancy < 1:
+            raise ValueError(
+                f"discrepancy is {discrepancy}; give the part of the signal that the circuit "
+                "leaves, such as 0.005"
+            )
         driver = serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
         seen = Inspected.of(unloaded)
         name = preflight(seen, periodic=True) or ("biased" if seen.is_aliased else None)
@@ -186,6 +203,7 @@ class Tracker(Overviewed, Kept):
             known,
             jnp.asarray(driver.source.response(rate - bands.frequency)),
             projection.freedom(),
+            discrepancy,
         )
         return cls(
             model=model,
@@ -197,6 +215,7 @@ class Tracker(Overviewed, Kept):
             electrodes=electrodes,
             period=period,
             line=sigma * float(np.sqrt(2 / period)),
+            discrepancy=discrepancy,
         )
 
     def _overview(self) -> Overview:
@@ -206,6 +225,8 @@ class Tracker(Overviewed, Kept):
             ("period", f"{self.period:g}", "samples"),
             ("change", f"{float(self.change):g}", "1/√pulse"),
         ]
+        if self.discrepancy:
+            rows.append(("discrepancy", per_cent(self.discrepancy), "of the signal"))
         return Overview(f"Tracker of {kind}, driver {of_driver}", rows)
 
     @in_float64

@@ -90,7 +90,8 @@ def by_frequency(
     """
     lane = used(seen, feed, circuit, found.remarks)
     size = seen.noise.power.shape[-1]  # padded harmonics follow
-    lane = Harmonics(*(of[:size] if np.ndim(of) else of for of in jax.tree.leaves(lane)))
+    every = jax.tree.leaves(dataclasses.replace(lane, filters=None))
+    lane = Harmonics(*(of[:size] if np.ndim(of) else of for of in every))
     samples = seen.periods[1]
     if is_white(found):
         white = np.square(seen.trusted) / samples

@@ -16,6 +16,7 @@ import numpy as np
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, near_miss
 from etid.recordings.resistance import resistance
+from etid.signals.low_pass import Filters, LowPass
 
 Type = Literal["text", "paths", "label", "number", "range", "samples"]
 
@@ -130,9 +131,10 @@ class Field:
             return tuple(map(self.checked, items))
         if self.type == "number":  # in a file it is none as text
             items[0] = real(self.name, items[0])
-        if self.values and isinstance(items[0], str) and items[0] not in self.values:
-            raise RecordingError(f"is {items[0]!r}")
-        return self.checked(items if many else items[0])
+        found = self.checked(items if many else items[0])
+        if self.values and found not in self.values:
+            raise RecordingError(f"is {found!r}")
+        return found
 
     def checked(self, value: Any) -> Any:
         """Value that a caller gives, as Python types; a resistance may be a text such as 98k8."""
@@ -140,9 +142,6 @@ class Field:
             return self.empty
         if self.type == "text" and not isinstance(value, str):
             raise RecordingError(f"is {value!r}, must be text", field=self.name)
-        if self.values and value not in self.values:
-            known = " or ".join(map(repr, self.values))
-            raise RecordingError(f"is {value!r}, must be {known}", field=self.name)
         if self.type in ("text", "label"):
             return text(self.name, value)
         if self.type == "paths":
@@ -285,15 +284,6 @@ class AbstractFields:
         "samples at these limits are saturated.",
         example=[-186.9, 186.9],
     )
-    hold: str | None = _field(
-        "text",
-        values=("zero",),
-        description="How the converter of a command holds it. With `zero`, `v_th` or `current` is "
-        "the command itself, which is held from each sample until the next, and no filter follows. "
-        "A sample of `v_out` is taken right after the step to the command of the same number. "
-        "Without it, all are samples of voltages or currents that end below half the sample rate.",
-        example="zero",
-    )
     instrument: str | None = _field(
         "text",
         forbidden="loaded",
@@ -301,6 +291,28 @@ class AbstractFields:
         "`etid.Instrument`. All calibrations of a driver state the same.",
         example="gain=1e-3 r_load=1e-3",
     )
+    v_out_filter: str | None = _field(
+        "text",
+        forbidden="calibration",
+        description="Low-pass that `v_out` has passed and `current` has not: kind (bessel or "
+        "butterworth), order, corner of -3 dB [Hz], and the corner's standard deviation [Hz] if it "
+        "is uncertain. It counts for a recording without `v_th`.",
+        example="butterworth 1 80000",
+    )
+    current_filter: str | None = _field(
+        "text",
+        forbidden="calibration",
+        description="Low-pass that `current` has passed and `v_out` has not, in the same words.",
+        example="bessel 4 2000 100",
+    )
+
+    @property
+    def filters(self) -> Filters | None:
+        """The filters of `v_out` and `current`; None if neither is stated."""
+        stated = [getattr(self, name) for name in FILTERS]
+        if stated == [None, None]:
+            return None
+        return Filters.of(*(None if one is None else LowPass.read(one) for one in stated))
 
 
 DECLARED: dict[str, Field] = {
@@ -316,6 +328,8 @@ DESCRIBING = {
     if field.type in ("label", "number") and field.required == "optional"
 }
 
+
+FILTERS = "v_out_filter", "current_filter"  # known filters of one channel
 
 Number = float | np.integer | np.floating
 
@@ -338,8 +352,9 @@ class Given(TypedDict, total=False):
     trial: Label | None
     calibration: str | Sequence[str] | None
     adc_range: Sequence[Number] | None
-    hold: str | None
     instrument: str | None
+    v_out_filter: str | None
+    current_filter: str | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -370,6 +385,17 @@ class Metadata(AbstractFields):
                 field="instrument",
                 remedy="State it in the calibrations of this recording",
             )
+        for name in FILTERS:
+            if (stated := getattr(self, name)) is None:
+                continue
+            if self.r_load is not None:
+                raise RecordingError(
+                    "a calibration has none: V_th and V_out pass the same filter", field=name
+                )
+            try:
+                LowPass.read(stated)
+            except ValueError as error:
+                raise RecordingError(str(error), field=name) from None
 
     def of_trial(self, path: str, trial: str) -> "Metadata":
         """The same with the path and the label of a trial, which no check concerns."""

@@ -136,7 +136,8 @@ class Recording(Overviewed, AbstractFields):
         **fields: All other fields, by name. `sample_rate` [Hz] and `pulse_rate` [Hz] are required.
             Optional are `path`; `r_load` [ohm], which makes the recording a calibration; the labels
             `subject`, `condition`, `electrode` and `trial`; `calibration`, the paths of its
-            calibrations; and `adc_range` [V].
+            calibrations; `adc_range` [V]; and `v_out_filter` and `current_filter`, low-pass filters
+            that one of the two has passed, such as `"bessel 4 2000"`.
 
     Raises:
         RecordingError: A field is wrong, or a record has a wrong shape or dtype. The values of the
