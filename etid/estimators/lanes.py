@@ -31,11 +31,12 @@ from etid.signals.harmonics import (
     harmonics_of,
     joins_aliases,
 )
+from etid.signals.hold import of_hold
 from etid.signals.lags import rest
 from etid.signals.low_pass import Filters
-from etid.signals.noise import Measurement, noise_of
+from etid.signals.noise import Measurement, floor, noise_of
 from etid.signals.rounding import rounding_variance
-from etid.signals.transfer import power
+from etid.signals.transfer import AnyArray, power
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
 _Harmonics = TypeVar("_Harmonics", bound="Harmonics")
@@ -207,7 +208,7 @@ class Harmonics(AbstractLane):
     def fields(self) -> Spectrum:
         """The harmonics without the sample rate."""
         of = (self.frequency, self.x, self.y, self.variance_x, self.variance_y, self.selected)
-        return Spectrum(*of, whole=self.periodic)
+        return Spectrum(*of, whole=self.periodic, held=isinstance(self, Held))
 
     @property
     def spectrum(self) -> Spectrum:
@@ -284,6 +285,38 @@ class Bins(Harmonics):
     def realigned(self, late: Lags) -> "Bins":
         """Refused: samples at one end would have to come from the other."""
         raise NotImplementedError("make the lane of the realigned recording")
+
+
+class Held(Bins):
+    """The same of a command that a converter holds between samples: X is that of the staircase.
+
+    It is the command itself, so that it has no noise but its rounding.
+    """
+
+    @staticmethod
+    def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
+        """The fields of a lane, in their order."""
+        return *_held(seen.bins.fields, seen), np.asarray(seen.recording.sample_rate)
+
+    @classmethod
+    def of_first(cls, seen: Inspected, samples: int) -> "Held":
+        """The lane of the first samples of the overlap."""
+        of = _held(seen.bins_of_first(samples).fields, seen)
+        return cls(*[*of, np.asarray(seen.recording.sample_rate)])
+
+    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> Lags:
+        """No samples: an output shows its command within the sample in which this is held."""
+        del circuit, driver
+        return Lags(0)
+
+
+def _held(fields: tuple[AnyArray, ...], seen: Inspected) -> tuple[AnyArray, ...]:
+    """The fields of a `Spectrum` of samples of a command, as those of its staircase."""
+    frequency, x, y, variance_x, *rest = fields
+    hold = of_hold(np.asarray(frequency) / seen.recording.sample_rate)
+    samples = seen.aligned[0].size
+    (least, _) = floor(seen.limits, seen.inspection.step[seen.row]) ** 2 / samples
+    return frequency, x * hold, y, least + 0 * variance_x, *rest
 
 
 class HarmonicsWithCurrent(Harmonics):

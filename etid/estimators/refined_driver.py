@@ -22,6 +22,7 @@ from etid.results.fit import complex_rrse
 from etid.results.instrument import Instrument
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals import modal
+from etid.signals.hold import DELAY, of_hold
 from etid.signals.knots import above_noise, banded
 from etid.signals.transfer import AnyArray, power
 
@@ -60,11 +61,17 @@ def from_harmonics(
     rate = np.asarray(records.sample_rate)[0]
     bands = banded(spectrum)
     spectra = above_noise(spectrum, bands)
-    baseline = iteration.periodic_driver_filter(spectra, r_load, rate, order).filter
+    of_samples = spectra
+    if spectra.held:  # a discrete filter takes the samples of the command
+        hold = of_hold(spectra.frequency / rate)
+        of_samples = dataclasses.replace(spectra, x=spectra.x / hold)
+    baseline = iteration.periodic_driver_filter(of_samples, r_load, rate, order).filter
     starts = source_starts(baseline.den, order, rate, r_load.mean())
     first = jax.tree.map(lambda of: of[0], starts)
-    calibration = Calibration(r_load, np.zeros(r_load.shape), delay_std(r_load))
-    width = delay_width(instrument, rate)
+    width, std = delay_width(instrument, rate), delay_std(r_load)
+    if spectra.held:
+        width, std = DELAY, np.minimum(std, DELAY)
+    calibration = Calibration(r_load, np.zeros(r_load.shape), std)
     model = Calibrations(first, calibration, spectra, rate, width, instrument)
     if r_load.size == 1:  # a single calibration does not show errors of the instrument
         model = dataclasses.replace(model, instrument=None)

@@ -91,7 +91,7 @@ def check_distinct(field: str, recordings: Sequence[Recording]) -> None:
 
 
 def check_alike(field: str, recordings: Sequence[Recording]) -> None:
-    """Refuse recordings of different lengths or rates.
+    """Refuse recordings of different lengths, rates or holds.
 
     Raises:
         RecordingError: There is none, or one differs from the first.
@@ -102,7 +102,8 @@ def check_alike(field: str, recordings: Sequence[Recording]) -> None:
     def of(one: Recording) -> str:
         size = one.samples["v_out"].stored.size
         rates = f"sample_rate {one.sample_rate} Hz, pulse_rate {one.pulse_rate} Hz"
-        return f"{several(size, 'sample')}, {rates}"
+        held = "" if one.hold is None else f", hold {one.hold}"
+        return f"{several(size, 'sample')}, {rates}{held}"
 
     for number, one in enumerate(recordings):
         if of(one) != of(recordings[0]):

@@ -25,6 +25,7 @@ from etid.estimators.lanes import (
     LANES,
     AbstractLane,
     Harmonics,
+    Held,
     Lags,
     replaced,
     stacked,
@@ -47,6 +48,7 @@ from etid.results.fit import Fit, Support
 from etid.results.verdicts import USABLE, message, verdicts_of
 from etid.selection.evidence import best
 from etid.selection.search import search
+from etid.signals.hold import NODES
 from etid.signals.transfer import AnyArray
 
 FEWEST = 16  # recordings that are read and fitted at once, however long they are
@@ -90,7 +92,9 @@ def known_of(
     """
     if not isinstance(lane, Harmonics):
         return None
-    return _known_of(_Same(driver), np.asarray(lane.frequency).tobytes(), shared, estimator)
+    held = float(lane.sample_rate) if isinstance(lane, Held) else 0.0
+    of = np.asarray(lane.frequency).tobytes(), shared, estimator, held
+    return _known_of(_Same(driver), *of)
 
 
 class _Same:
@@ -107,8 +111,15 @@ class _Same:
 
 
 @functools.lru_cache(maxsize=4)
-def _known_of(driver: _Same, frequency: bytes, shared: bool, estimator: AbstractEstimator) -> Any:
-    return known_at(np.frombuffer(frequency), driver.driver, shared, estimator)
+def _known_of(
+    driver: _Same, frequency: bytes, shared: bool, estimator: AbstractEstimator, held: float
+) -> Any:
+    """`known_of`; `held` is the sample rate of a command that a converter holds, else 0."""
+    known = known_at(np.frombuffer(frequency), driver.driver, shared, estimator)
+    if held == 0:
+        return known
+    beyond = known_at(NODES * held, driver.driver, False, estimator)
+    return dataclasses.replace(known, beyond=beyond)
 
 
 def checksum(seen: Inspected) -> int:

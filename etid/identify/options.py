@@ -15,7 +15,7 @@ from etid.circuits.current_dependent import current_dependent
 from etid.estimators.element_limits import Limits, checked_limits
 from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
-from etid.estimators.lanes import Harmonics
+from etid.estimators.lanes import Harmonics, Held
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.verdict import ACCEPT
 from etid.estimators.output_error import OutputError
@@ -314,8 +314,17 @@ def check_order(order: Order, estimator: AbstractEstimator) -> None:
 
 
 def unfit(estimator: AbstractEstimator, seen: Inspected) -> str | None:
-    """Why the data that an estimator takes of a recording cannot be fitted; None if they can."""
+    """Why the data that an estimator takes of a recording cannot be fitted; None if they can.
+
+    Raises:
+        ValueError: The estimator takes no commands that a converter holds.
+    """
     kind = estimator.lane_of(seen)
+    if seen.is_held and not issubclass(kind, Held):
+        raise ValueError(
+            f"recording {seen.recording.path!r}: the method {str(estimator)!r} takes no command "
+            "that a converter holds; use the method maximum_likelihood"
+        )
     if kind.periodic and not seen.is_periodic:
         return "not_periodic"
     aliased = issubclass(kind, Harmonics) and (

@@ -73,8 +73,9 @@ def predict(
         feed = untraced(serving(feed, ContinuousDriver, MAXIMUM_LIKELIHOOD.name))
     # Disturbed periods are predicted too.
     seen, simulated = Inspected(Inspection([recording])), load.impedance().has_response
-    if not load.is_rational and (seen.whole_periods[0] > 0 or not simulated):
-        if isinstance(feed, ContinuousDriver):
+    periodic = seen.whole_periods[0] > 0 and not seen.is_held
+    if not load.is_rational and (periodic or not simulated):
+        if not seen.is_held and isinstance(feed, ContinuousDriver):
             return _predict_periods(Inspected.of(recording), feed, load)
         if not simulated:
             raise ValueError(
@@ -82,7 +83,8 @@ def predict(
                 "predicted from a measured current; use a ratio of polynomials in s or constant "
                 "phases"
             )
-    inner = fitted_voltage(*seen.aligned, recording.sample_rate, feed, untraced(load))
+    of = *seen.aligned, recording.sample_rate, feed, untraced(load), seen.is_held
+    inner = fitted_voltage(*of)
     first = TAPS - 1 + max(seen.lag, 0)
     edges = first, recording.v_out.size - first - inner.size
     return namespace(inner).pad(inner, edges, constant_values=np.nan)
@@ -119,6 +121,7 @@ def fitted_voltage(
     sample_rate: float,
     feed: ContinuousDriver | MeasuredCurrent,
     circuit: AbstractCircuit,
+    held: bool = False,
 ) -> Float[AnyArray, " interval"]:
     """Terminal voltage [V] with a load, fitted to an aligned record, without its edges.
 
@@ -130,8 +133,13 @@ def fitted_voltage(
         sample_rate: Samples per second [Hz].
         feed: The driver, or the measured current.
         circuit: The load.
+        held: Whether a converter holds the input between its samples. There is no delay then.
     """
     inputs, delayed = band_limited(v_th, WHOLE), shiftable(v_out, WHOLE)
+    if held:
+        inner = slice(TAPS - 1, TAPS - 1 + inputs.shape[0])
+        inputs = np.pad(v_th[inner, None], ((0, 0), (0, inputs.shape[1] - 1)))
+        delayed = v_out[inner, None]
     load = circuit.impedance()
     load = load.in_time(sample_rate, inputs.shape[0])
     load = load if isinstance(load, StateSpace) else realise(load, sample_rate)
@@ -158,7 +166,9 @@ def fitted_voltage(
         if late is not None:
             flow = (loop.A @ q[1 : states + 1] + loop.B[:, 0] * inputs[0, 0]) / sample_rate
             columns = [*known, simulate(late, rates, xp.pad(flow, (0, states)))[0]]
-        by_delay = xp.polyval((delayed[:, 1:] * powers)[:, ::-1].T, -q[0])
+        by_delay = 0.0 * forced
+        if not held:
+            by_delay = xp.polyval((delayed[:, 1:] * powers)[:, ::-1].T, -q[0])
         q = q - _solved(xp.stack([by_delay, *columns], axis=1), residual(q))
     return residual(q) + delayed[:, 0]
 

@@ -33,6 +33,8 @@ from etid.results.feed import SourceImpedance
 from etid.results.instrument import Instrument
 from etid.signals import modal
 from etid.signals.harmonics import Spectrum, same_unloaded, signal_share
+from etid.signals.hold import DELAY, NODES, images
+from etid.signals.hold import added as added_by
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import (
     AnyArray,
@@ -123,7 +125,7 @@ class Calibrations:
     def of(cls, driver: HarmonicDriver) -> "Calibrations":
         """The calibrations of an identified driver."""
         rate = namespace(driver.sample_rate).asarray(driver.sample_rate)
-        width = delay_width(driver.instrument, rate)
+        width = DELAY if driver.spectra.held else delay_width(driver.instrument, rate)
         of = driver.source, driver.calibration, driver.spectra, rate, width
         return cls(*of, instrument=driver.instrument)
 
@@ -267,14 +269,44 @@ class Calibrations:
     ) -> Complex[AnyArray, "*row record bin"]:
         """Gains R e^(−jωτ) / (R + Z_th) with the known resistors, at all harmonics or at knots."""
         f = self._frequency(every)
-        z_th = modal.impedance(self.parameters(common)[..., None, :], self._sections, f)
-        return self._gains(common, f, z_th)[0]
+        turn, gains = self._turn(common, f), self._gains(common, f)
+        if self.spectra.held:
+            gains = gains + added_by(self._gains(common, self._nodes), self._images(every))
+        return gains * turn
 
     def _frequency(self, every: Knots | None) -> Float[AnyArray, "record bin"]:
         of = self.spectra.frequency
         return of if every is None else every.at(of)
 
+    @property
+    def _nodes(self) -> Float[AnyArray, "record node"]:
+        """Frequencies beyond the bins whose gains a hold needs [Hz]."""
+        at = NODES * self.rate
+        return namespace(at).broadcast_to(at, (self.spectra.x.shape[0], NODES.size))
+
+    @functools.cached_property
+    def _of_every(self) -> Complex[AnyArray, "part bin"]:
+        return images(self.spectra.frequency[0] / self.rate)
+
+    def _images(self, every: Knots | None) -> Complex[AnyArray, "part bin"]:
+        return self._of_every if every is None else self._of_every[:, every.index]
+
+    def _turn(
+        self, common: Float[AnyArray, "*row common"], f: Float[AnyArray, "record bin"]
+    ) -> Complex[AnyArray, "*row record bin"]:
+        """e^(−jωτ) of each calibration."""
+        late = self.delays(common)
+        one = as_complex(namespace(late, f).ones_like(f + late[..., None]))
+        return delayed(one, f, late, self.rate)
+
     def _gains(
+        self, common: Float[AnyArray, "*row common"], f: Float[AnyArray, "record bin"]
+    ) -> Complex[AnyArray, "*row record bin"]:
+        """The gains without delays."""
+        z_th = modal.impedance(self.parameters(common)[..., None, :], self._sections, f)
+        return self._without_delays(common, f, z_th)[0]
+
+    def _without_delays(
         self,
         common: Float[AnyArray, "*row common"],
         f: Float[AnyArray, "record bin"],
@@ -292,7 +324,7 @@ class Calibrations:
             right = known * (1 + of_each[..., 0, :, :])
             resistance = right * reciprocal(1 + s * of_each[..., 1, :, :] * right)
         loop = reciprocal(resistance + z_th)
-        gains = delayed(resistance * loop, f, self.delays(common), self.rate)
+        gains = resistance * loop
         by_z = -gains * loop
         if self.instrument is None:
             return gains, by_z, None
@@ -312,14 +344,29 @@ class Calibrations:
     def slopes(self, common: Float[AnyArray, "*row common"], every: Knots | None = None) -> Slopes:
         """The gains and their derivatives, at all harmonics or at knots."""
         f, xp = self._frequency(every), namespace(common, self.spectra.x)
+        z_th, gains, by_z, by_q = self._slopes(common, f)
+        turn = self._turn(common, f)
+        if self.spectra.held:
+            _, of_nodes, _, by_nodes = self._slopes(common, self._nodes)
+            of = self._images(every)
+            gains, by_q = gains + added_by(of_nodes, of), by_q + added_by(by_nodes, of)
+        gains, by_z, by_q = gains * turn, by_z * turn, by_q * turn[..., None, :, :]
+        by_delay = (-gains * frequency_variable(f / self.rate))[..., None, :, :]
+        by_delay = np.eye(f.shape[0])[:, :, None] * by_delay
+        before, after = by_q[..., : self._of_source, :, :], by_q[..., self._of_source :, :, :]
+        return Slopes(z_th, gains, by_z, by_z, xp.concatenate([before, by_delay, after], -3))
+
+    def _slopes(
+        self, common: Float[AnyArray, "*row common"], f: Float[AnyArray, "record bin"]
+    ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
+        """Z_th, the gains without delays, their derivatives by Z_th, and by all but the delays."""
+        xp = namespace(common, self.spectra.x)
         of = self.parameters(common)[..., None, :], self._sections, f
         z_th, by_source = modal.with_slopes(*of)
-        gains, by_z, by_error = self._gains(common, f, z_th)
-        by_source = xp.moveaxis(by_source, -2, -3) * by_z[..., None, :, :]
-        by_delay = (-gains * frequency_variable(f / self.rate))[..., None, :, :]
-        rows = [by_source, np.eye(f.shape[0])[:, :, None] * by_delay]
+        gains, by_z, by_error = self._without_delays(common, f, z_th)
+        rows = [xp.moveaxis(by_source, -2, -3) * by_z[..., None, :, :]]
         rows += [] if by_error is None else [by_error]
-        return Slopes(z_th, gains, by_z, by_z, xp.concatenate(rows, -3))
+        return z_th, gains, by_z, xp.concatenate(rows, -3)
 
     @array_function
     def around(

@@ -9,6 +9,9 @@ Errors of the instrument that act on loads change them as `DIRECTIONS` says,
 
     V_out / V_th = (1 + g) Z' / (Z' + Z_th) + κ,      Z' = Z_L ‖ C.
 
+Behind a command that a converter holds, each output has what the images of the hold add
+(`etid.signals.hold`).
+
 What no circuit explains multiplies each output by e^δ, where δ is smooth in frequency
 (`etid.likelihood.discrepancy`); its coefficients are parameters after the corners.
 
@@ -30,6 +33,7 @@ from etid.likelihood.discrepancy import Discrepancy
 from etid.likelihood.profile import along_outputs
 from etid.likelihood.source import Source
 from etid.precision import Module, namespace
+from etid.signals.hold import added
 from etid.signals.low_pass import Filters
 from etid.signals.transfer import AnyArray, as_complex, frequency_variable, reciprocal, turns
 
@@ -110,6 +114,9 @@ class Gains:
         outputs: The outputs.
         discrepancy: δ; None where the model is exact.
         filters: The known filters of V_out and of a current that causes it; None without any.
+        images: What the images of a held command add (`etid.signals.hold.images`); None if none is
+            held.
+        nodes: The same loads at the nodes of `images`.
     """
 
     source: Source
@@ -119,6 +126,8 @@ class Gains:
     outputs: AbstractOutputs = dataclasses.field(default_factory=Voltage)
     discrepancy: Discrepancy | None = None
     filters: Filters | None = None
+    images: Complex[AnyArray, "part bin"] | None = None
+    nodes: "Gains | None" = None
 
     @property
     def elements(self) -> int:
@@ -151,13 +160,15 @@ class Gains:
         delta = self.discrepancy and self.discrepancy.rows(rows)
         filters = self.filters and self.filters.rows(rows)
         of = {"frequency": self.frequency[rows], "discrepancy": delta, "filters": filters}
-        return dataclasses.replace(self, **of)
+        return dataclasses.replace(self, **of, nodes=self.nodes and self.nodes.of(rows))
 
     def at(self, index: np.ndarray) -> "Gains":
         """The same at some of the frequencies."""
         source, frequency = self.source.at(index), self.frequency[..., index]
         delta = self.discrepancy and self.discrepancy.at(index)
-        return dataclasses.replace(self, source=source, frequency=frequency, discrepancy=delta)
+        images = None if self.images is None else self.images[:, index]
+        of = {"source": source, "frequency": frequency, "discrepancy": delta, "images": images}
+        return dataclasses.replace(self, **of)
 
     def _departed(self, q: Float[AnyArray, "*row q"]) -> Complex[AnyArray, "*row output bin"]:
         """e^δ."""
@@ -240,7 +251,14 @@ class Gains:
         if self.filters is not None:
             values[0] = values[0] * self.filters.error(self.frequency, self._corners(q))
         gains = along_outputs(values)
+        if self.images is not None and self.nodes is not None:
+            gains = gains + added(self.nodes.undelayed(self._at_nodes(q)), self.images)
         return gains if self.discrepancy is None else gains * self._departed(q)
+
+    def _at_nodes(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row q"]:
+        """The parameters without delays, and without δ."""
+        logs, delays, z = self.split(q)
+        return namespace(q).concatenate([logs, 0 * delays, z], -1)
 
     def slopes(self, q: Float[AnyArray, "*row q"]) -> Slopes:
         """The gains and their derivatives, at a few frequencies."""
@@ -276,13 +294,22 @@ class Gains:
             values = values * scale + first * offset[..., None, :] * turn
             by_at = by_at * (share * xp.ones_like(at))[..., None, :]
         unit, s = np.eye(self.outputs.count)[:, :, None], frequency_variable(self.frequency)
-        by_delay = unit * ((-s / self.sample_rate)[..., None, :] * values)[..., None, :, :]
+        s = (s / self.sample_rate)[..., None, :]
+        by_delay = unit * (-s * values)[..., None, :, :]
         of_w = by_source * loaded[..., None, :]
         by_z = self.source.w_by_z(z)[..., None, :] * of_w[..., None, :, :]
         if of_faults is not None and self.source.tolerances is not None:
             sizes = self.source.tolerances.faults_by_z[:, :, None, None]
             by_z = by_z + (sizes * of_faults[..., None, :, :, :]).sum(-3)
-        own = [by_element[..., None, :] * by_at[..., None, :, :], by_delay]
+        by_element = by_element[..., None, :] * by_at[..., None, :, :]
+        if self.images is not None and self.nodes is not None:
+            of = self.nodes.slopes(self._at_nodes(q))
+            late = added(of.gains, self.images) * turn
+            values, by_delay = values + late, by_delay - unit * (s * late)[..., None, :, :]
+            every = added(of.by_q, self.images) * turn[..., None, :, :]
+            by_element = by_element + every[..., : self.elements, :, :]
+            by_z = by_z + every[..., self.exact :, :, :]
+        own = [by_element, by_delay]
         if self.filters is not None:  # V_out is the only output of a current
             corners = self._corners(q)
             by = self.filters.error(self.frequency, corners)[..., None, :]

@@ -71,6 +71,8 @@ class Source(NamedTuple):
         errors: What errors of the instrument do; None behind a measured current.
         decays: What a voltage of each of its states looks like, per unit of it; None if no record
             needs them.
+        beyond: The same at the nodes of a hold (`etid.signals.hold`); None if no record needs
+            them.
     """
 
     frequency: Float[AnyArray, " bin"]
@@ -84,6 +86,7 @@ class Source(NamedTuple):
     tolerances: Tolerances | None = None
     errors: Errors | None = None
     decays: Complex[AnyArray, "decay bin"] | None = None
+    beyond: "Source | None" = None
 
     def at(self, index: np.ndarray) -> "Source":
         """The same at some of the harmonics."""

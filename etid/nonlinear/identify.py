@@ -124,8 +124,8 @@ def identify_amplitudes(
         RecordingError: There is no recording, one is given twice, the recordings have different
             lengths or rates, they lack V_th or the current, or all have one amplitude and the load
             depends on its current.
-        ValueError: The driver was identified by another method, or the circuit has several
-            resistors that depend on their current.
+        ValueError: The driver was identified by another method, the circuit has several resistors
+            that depend on their current, or a converter holds the command of a recording.
         IdentificationError: The result cannot be used and `throw` is set.
     """
     driver = driver_of(driver)
@@ -146,6 +146,11 @@ def identify_amplitudes(
     check_distinct("recordings", of)
     seen = [Inspected.of(one) for one in fed_by]
     for one in seen:
+        if one.is_held:
+            raise ValueError(
+                f"recording {one.recording.path!r}: several amplitudes are not fitted behind a "
+                "command that a converter holds; identify each recording alone"
+            )
         _, name = plan(options, one, feed)
         if name is not None:
             fit = failed_fit(name, options, METHOD)

@@ -131,10 +131,9 @@ class Field:
             return tuple(map(self.checked, items))
         if self.type == "number":  # in a file it is none as text
             items[0] = real(self.name, items[0])
-        found = self.checked(items if many else items[0])
-        if self.values and found not in self.values:
-            raise RecordingError(f"is {found!r}")
-        return found
+        if self.values and isinstance(items[0], str) and items[0] not in self.values:
+            raise RecordingError(f"is {items[0]!r}")
+        return self.checked(items if many else items[0])
 
     def checked(self, value: Any) -> Any:
         """Value that a caller gives, as Python types; a resistance may be a text such as 98k8."""
@@ -142,6 +141,9 @@ class Field:
             return self.empty
         if self.type == "text" and not isinstance(value, str):
             raise RecordingError(f"is {value!r}, must be text", field=self.name)
+        if self.values and value not in self.values:
+            known = " or ".join(map(repr, self.values))
+            raise RecordingError(f"is {value!r}, must be {known}", field=self.name)
         if self.type in ("text", "label"):
             return text(self.name, value)
         if self.type == "paths":
@@ -284,6 +286,15 @@ class AbstractFields:
         "samples at these limits are saturated.",
         example=[-186.9, 186.9],
     )
+    hold: str | None = _field(
+        "text",
+        values=("zero",),
+        description="How the converter of a command holds it. With `zero`, `v_th` or `current` is "
+        "the command itself, which is held from each sample until the next, and no filter follows. "
+        "A sample of `v_out` is taken right after the step to the command of the same number. "
+        "Without it, all are samples of voltages or currents that end below half the sample rate.",
+        example="zero",
+    )
     instrument: str | None = _field(
         "text",
         forbidden="loaded",
@@ -352,6 +363,7 @@ class Given(TypedDict, total=False):
     trial: Label | None
     calibration: str | Sequence[str] | None
     adc_range: Sequence[Number] | None
+    hold: str | None
     instrument: str | None
     v_out_filter: str | None
     current_filter: str | None
@@ -378,6 +390,12 @@ class Metadata(AbstractFields):
             raise RecordingError(
                 "a recording with a known resistor (r_load) is a calibration; it has none itself",
                 field="calibration",
+            )
+        if self.hold is not None and (self.v_out_filter or self.current_filter):
+            raise RecordingError(
+                "no filter may follow a command that a converter holds",
+                field="hold",
+                remedy="Remove v_out_filter and current_filter, or measure what passes them",
             )
         if self.r_load is None and self.instrument is not None:
             raise RecordingError(

@@ -140,7 +140,13 @@ class Inspection:
             v = self.recorded[row, which]
             step = float(self.step[row, which]) or step_of(v)
             found[row, which] = step if is_coarse(v, step) else 0.0
+        found[self.held, 0] = 0.0  # a command has the values that it has
         return found
+
+    @functools.cached_property
+    def held(self) -> Bool[np.ndarray, " recording"]:
+        """Whether a converter holds the cause of `v_out` between its samples."""
+        return np.array([one.hold is not None for one in self.recordings])
 
     @functools.cached_property
     def train(self) -> list[PulseTrain]:
@@ -463,6 +469,7 @@ def _saturated(seen: Inspection, rows: _Rows) -> _Holds:
     records, limits = _part(seen.recorded, rows), seen.recorded_limits[rows]
     sigma, step = seen.sigma[rows], seen.step[rows]
     found = faults.saturated(records, limits, step, adc_range)
+    found[:, 0] &= ~seen.held[rows]  # a command may rest at its limits
     if seen.has_current:
         found[:, 0] &= ~faults.held(sigma[:, 0], step[:, 0], seen.spans[rows, 0])
         return np.asarray(found.any(1))  # a stimulator that holds its voltage is no fault

@@ -123,14 +123,20 @@ class Inspected:
             (self.noise, *periods) if periods[0] > 1 else None,
             np.asarray(floor(self.limits, self.inspection.step[self.row])),
             np.asarray(self.coarse),
-            periods[0] > 0 and self.has_no_aliases,
+            self.is_held or (periods[0] > 0 and self.has_no_aliases),
             self.has_current,
         )
 
     @property
+    def is_held(self) -> bool:
+        """Whether a converter holds the cause of `v_out` between its samples."""
+        return bool(self.inspection.held[self.row])
+
+    @property
     def is_whole(self) -> bool:
         """Whether the recording holds whole periods whose aliases are known."""
-        return self.is_periodic and (self.periods[0] > 1 or self.has_no_aliases)
+        known = self.is_periodic and not self.is_held
+        return known and (self.periods[0] > 1 or self.has_no_aliases)
 
     @property
     def spectrum(self) -> tuple[np.ndarray, ...]:

@@ -58,6 +58,7 @@ class Spectrum(Module):
         selected: Harmonics that are used; all of them if aliases fall between them.
         whole: Whether the records are whole periods. If not, these are the bins of the transform of
             any record, but for bin 0.
+        held: Whether `x` is that of a command that a converter holds between samples.
     """
 
     frequency: Float[AnyArray, "*lane harmonic"]
@@ -67,6 +68,7 @@ class Spectrum(Module):
     variance_y: Float[AnyArray, "*lane harmonic"]
     selected: Bool[AnyArray, "*lane harmonic"]
     whole: bool = eqx.field(static=True, default=True)
+    held: bool = eqx.field(static=True, default=False)
 
 
 def same_unloaded(

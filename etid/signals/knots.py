@@ -180,6 +180,7 @@ def banded(spectrum: Spectrum) -> Spectrum:
         variance_x=variance(spectrum.variance_x),
         variance_y=variance(spectrum.variance_y),
         selected=present,
+        held=spectrum.held,
     )
 
 

@@ -23,7 +23,7 @@ from etid.estimators.estimator import (
     serving,
 )
 from etid.estimators.judgement import STRAINED
-from etid.estimators.lanes import AbstractLane, Bins, Harmonics, HarmonicsWithCurrent, taken
+from etid.estimators.lanes import AbstractLane, Bins, Harmonics, HarmonicsWithCurrent, Held, taken
 from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import fit_one, fit_rows
@@ -146,6 +146,8 @@ class MaximumLikelihood(AbstractEstimator):
 
     def lane_of(self, seen: Inspected) -> type[AbstractLane]:
         """The harmonics of whole periods, or the bins of any other record."""
+        if seen.is_held:
+            return Held
         return self.lane if seen.is_whole else Bins
 
     def lane_of_periods(self, periods: int) -> type[AbstractLane]:

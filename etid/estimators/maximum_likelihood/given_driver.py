@@ -100,6 +100,7 @@ class GivenDriver(Module):
         aside: Distance of the first delay of a search from that of its start [samples].
         by_current: Whether the input is a measured current: the gain is Z_L, and there is no z.
         decays: Those of the states of the driver, for records that are not of whole periods.
+        beyond: The same at the nodes of a hold; None if no record needs them.
     """
 
     frequency: Float[AnyArray, " harmonic"]
@@ -120,6 +121,7 @@ class GivenDriver(Module):
     aside: Float[AnyArray, ""] = eqx.field(default_factory=lambda: np.zeros(()))
     by_current: bool = eqx.field(static=True, default=False)
     decays: Complex[AnyArray, "decay harmonic"] | None = None
+    beyond: "GivenDriver | None" = None
 
     @classmethod
     def measured(cls, frequency: Float[AnyArray, " harmonic"]) -> "GivenDriver":

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.lanes import Bins, Harmonics, HarmonicsWithCurrent, stacked
+from etid.estimators.lanes import Bins, Harmonics, HarmonicsWithCurrent, Held, stacked
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.verdict import judged
 from etid.likelihood.fit import Estimate, fit
@@ -29,6 +29,7 @@ from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
 from etid.signals.harmonics import same_unloaded
+from etid.signals.hold import DELAY, NODES, images
 
 
 def source_of(known: GivenDriver) -> Source:
@@ -44,7 +45,8 @@ def source_of(known: GivenDriver) -> Source:
         tolerances = Tolerances(*known.faults, known.bend, *bending)
     loaded = None if known.by_current else known.loaded
     numbers = known.w_slope, known.slope, known.resistance, known.mean, known.cov
-    of_states = known.delay_width, tolerances, errors, known.decays
+    beyond = None if known.beyond is None else source_of(known.beyond)
+    of_states = known.delay_width, tolerances, errors, known.decays, beyond
     return Source(known.frequency, loaded, *numbers, *of_states)
 
 
@@ -79,6 +81,8 @@ def load_of(
         unloaded = Unloaded.by(shared, records, same)
     rate, filters = lane.sample_rate.reshape(-1)[0], lane.filters
     gains = Gains(source, circuit, lane.frequency, rate, outputs, filters=filters)
+    if isinstance(lane, Held):
+        gains = held(gains, lane.x.shape[:-1])
     load = load_with(gains, records, prior, unloaded)
     if not isinstance(lane, Bins):
         return load
@@ -90,6 +94,15 @@ def load_of(
         of_x = width_of(lane.x[..., None, :], used)[..., 0]
         transient = transient.filtered(filters, lane.frequency, of_x)
     return dataclasses.replace(load, transient=transient)
+
+
+def held(gains: Gains, rows: tuple[int, ...]) -> Gains:
+    """The gains behind a command that a converter holds."""
+    assert gains.source.beyond is not None
+    place = gains.frequency.reshape(-1, gains.frequency.shape[-1])[0] / gains.sample_rate
+    at = namespace(gains.frequency).broadcast_to(NODES * gains.sample_rate, (*rows, NODES.size))
+    nodes = Gains(gains.source.beyond, gains.circuit, at, gains.sample_rate, gains.outputs)
+    return dataclasses.replace(gains, images=images(place), nodes=nodes)
 
 
 def load_with(
@@ -105,6 +118,8 @@ def load_with(
         own = prior.centre, prior.width
     # How little the delays of V_out scatter tells nothing about those of other outputs.
     of_delays = xp.reshape(source.delay_width, 1), np.full(delays - 1, DELAY_WIDTH)
+    if gains.images is not None:
+        of_delays = (np.full(delays, DELAY),)
     corners = gains.exact - gains.delays.stop  # [their standard deviations]
     centre = xp.concatenate([own[0], np.zeros(delays + corners), source.mean])
     width = xp.concatenate([own[1], *of_delays, np.ones(corners + source.mean.size)])
