@@ -237,7 +237,7 @@ _Several = TypeVar("_Several", CandidateFits, list[Any])
 def refitted(
     lanes: Sequence[AbstractLane],
     seen: Sequence[Inspected],
-    fit: Callable[[Sequence[AbstractLane]], _Several],
+    fit: Callable[[Sequence[AbstractLane], bool], _Several],
     late_by: Callable[[Sequence[AbstractLane], _Several], Mapping[int, Lags]],
     may_hum: Callable[[_Several], Iterable[int]],
     better: Callable[[Any, Any], Any],
@@ -247,7 +247,8 @@ def refitted(
     Args:
         lanes: Lanes of the recordings.
         seen: The recordings. The function corrects the lag of those that are late.
-        fit: Fits lanes. Each lane can be read from the result and written into it by its number.
+        fit: Fits lanes, whose circuits may be inexact or not. Each lane can be read from the result
+            and written into it by its number.
         late_by: Lags of lanes behind their fits, by number; only those that are late.
         may_hum: Numbers of the lanes whose fits show hum, or that hum may explain.
         better: The better of two fits of a lane; the second is without the mains harmonics.
@@ -265,13 +266,14 @@ def refitted(
         less = {row: lanes[row].without_mains() for row in may_hum(found)}
         return {row: lane for row, lane in less.items() if lane is not None}
 
-    found = fit(lanes)
-    for change, choose, why in (
-        (aligned, lambda _, second: second, "with v_out aligned to the first fit"),
-        (without_mains, better, "without the mains harmonics"),
+    found = fit(lanes, True)
+    # A second fit that is not exact would not be the better one.
+    for change, inexact, choose, why in (
+        (aligned, True, lambda _, second: second, "with v_out aligned to the first fit"),
+        (without_mains, False, better, "without the mains harmonics"),
     ):
         if changed := change(found):
-            again = fit(list(changed.values()))
+            again = fit(list(changed.values()), inexact)
             for number, row in enumerate(changed):
                 second = again[number]
                 found[row] = kept = choose(found[row], second)
@@ -284,7 +286,7 @@ def refitted(
 def refitted_loads(
     lanes: Sequence[AbstractLane],
     seen: Sequence[Inspected],
-    fit: Callable[[Sequence[AbstractLane], AbstractCircuit], Fit],
+    fit: Callable[[Sequence[AbstractLane], AbstractCircuit, bool], Fit],
     driver: AbstractFeed,
     candidates: Sequence[AbstractCircuit],
 ) -> CandidateFits:
@@ -293,17 +295,17 @@ def refitted_loads(
     Args:
         lanes: Lanes of the recordings.
         seen: The recordings. The function corrects the lag of those that are late.
-        fit: Fits a circuit to lanes; the fits are stacked.
+        fit: Fits a circuit to lanes, which may be inexact or not; the fits are stacked.
         driver: The driver of the recordings.
         candidates: Circuits to choose from.
     """
 
-    def searched(lanes: Sequence[AbstractLane]) -> CandidateFits:
+    def searched(lanes: Sequence[AbstractLane], inexact: bool) -> CandidateFits:
         if len(candidates) == 1:
-            return CandidateFits(fit(lanes, candidates[0]))
+            return CandidateFits(fit(lanes, candidates[0], inexact))
 
         def rows(number: int, rows: Sequence[int]) -> list[Fit]:
-            return unstacked(fit([lanes[row] for row in rows], candidates[number]))
+            return unstacked(fit([lanes[row] for row in rows], candidates[number], inexact))
 
         found = search(len(lanes), candidates, rows)
         several = {row: fits for row, fits in enumerate(found) if len(fits) > 1}
@@ -474,21 +476,28 @@ class Batch:
         """The fits of the best of these circuits, with their verdicts."""
         _, driver, estimator, _, shared = self.like
 
-        def alike(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
-            known = known_of(lanes[0], driver, shared, estimator)
-            found = fits_of(lanes, driver, known, circuit, estimator)
+        exact = estimator
+        if isinstance(estimator, MaximumLikelihood):
+            exact = dataclasses.replace(estimator, accept=0.0)
+
+        def alike(
+            lanes: Sequence[AbstractLane], circuit: AbstractCircuit, of: AbstractEstimator
+        ) -> Fit:
+            known = known_of(lanes[0], driver, shared, of)
+            found = fits_of(lanes, driver, known, circuit, of)
             if not isinstance(known, GivenDriver) or not has_open_resonance(driver):
                 return found
             aside = dataclasses.replace(known, aside=np.asarray(ASIDE))
-            return likelier(found, fits_of(lanes, driver, aside, circuit, estimator))
+            return likelier(found, fits_of(lanes, driver, aside, circuit, of))
 
-        def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
+        def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit, inexact: bool) -> Fit:
             rows: dict[Any, list[int]] = {}  # those that are realigned may have other shapes
             for row, lane in enumerate(lanes):
                 rows.setdefault(lane.shapes, []).append(row)
+            of = estimator if inexact else exact
             if len(rows) == 1:
-                return alike(lanes, circuit)
-            parts = [alike([lanes[row] for row in each], circuit) for each in rows.values()]
+                return alike(lanes, circuit, of)
+            parts = [alike([lanes[row] for row in each], circuit, of) for each in rows.values()]
             whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
             return taken(whole, np.argsort(np.concatenate(list(rows.values()))))
 

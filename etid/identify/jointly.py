@@ -194,9 +194,10 @@ class _Group:
 
     @one_thread()
     @array_function
-    def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
+    def _alone(self, lanes: Sequence[AbstractLane], inexact: bool = True) -> list[_Start]:
         every, of, parts = cast("Sequence[Harmonics]", lanes), source_of(self.known).errors, []
-        for found, changed in estimates(every, self.known, self.circuit, self.prior):
+        of_all = self.known, self.circuit, self.prior, inexact
+        for found, changed in estimates(every, *of_all):
             errors = np.zeros((len(changed), 0))
             if self.driver.instrument is not None and of is not None:
                 errors = of.at + found.z @ of.by_z

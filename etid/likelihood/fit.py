@@ -85,18 +85,21 @@ class Estimate(NamedTuple):
 
 @array_function
 def fit(
-    load: Load, starts: Float[AnyArray, "start *row q"], aside: Float[AnyArray, ""] | float = 0.0
+    load: Load,
+    starts: Float[AnyArray, "start *row q"],
+    aside: Float[AnyArray, ""] | float = 0.0,
+    inexact: bool = True,
 ) -> Estimate:
-    """The fits from their starts; for the arguments see `etid.likelihood.search.minimum`.
+    """The fits from their starts; for the other arguments see `etid.likelihood.search.minimum`.
 
     Where a circuit leaves more than the noise, NumPy fits records anew with what it leaves
-    (`etid.likelihood.approximate`). Under JAX elements and delays have derivatives, and
-    nothing else.
+    (`etid.likelihood.approximate`), if circuits may be `inexact`. Under JAX elements and delays
+    have derivatives, and nothing else.
     """
     least = minimum(load, starts, aside)
     logs, delays, z = load.gains.split(least.q)
     found = _estimate(load, least)._replace(logs=logs, delays=delays, z=z)
-    if namespace(least.q) is not np:
+    if namespace(least.q) is not np or not inexact:
         return found
     smooth = is_smooth(least.near.condensed.part, load.gains.exact)
     if smooth.any():

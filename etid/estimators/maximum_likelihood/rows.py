@@ -154,10 +154,12 @@ def estimates(
     known: GivenDriver,
     circuit: AbstractCircuit,
     prior: ElementPrior | None,
+    inexact: bool,
 ) -> Iterator[tuple[Estimate, Bool[np.ndarray, " row"]]]:
     """Fits of recordings of equal length and rates without their verdicts, a few at a time.
 
-    Beside each stands whether its unloaded voltage shows that the driver has changed.
+    Beside each stands whether its unloaded voltage shows that the driver has changed. What a
+    circuit leaves beyond noise becomes part of the fit if circuits may be `inexact`.
     """
     known = jax.tree.map(np.asarray, known)
     source, shared = source_of(known), calibrated(known)
@@ -166,7 +168,7 @@ def estimates(
         changed = np.zeros(len(load.records.x), bool)
         if known.shape is not None:
             changed = differs(known.shape, load.records)
-        yield fit(load, starts(load), float(known.aside)), changed
+        yield fit(load, starts(load), float(known.aside), inexact), changed
 
 
 @one_thread()
@@ -183,5 +185,5 @@ def fit_rows(
 ) -> list[Fit]:
     """The fits of recordings of equal length and rates, in chunks that are stacked."""
     of = driver.result, method, prior, bounds, accept
-    every = estimates(lanes, known, circuit, prior)
+    every = estimates(lanes, known, circuit, prior, accept > 0)
     return [judged(found, circuit, changed, *of) for found, changed in every]
