@@ -16,7 +16,7 @@ NAMES = (
     *("spice", "coverage", "driver_order", "delays", "noise", "tolerances", "selection", "design"),
     *("speed", "curves", "scale", "amplitudes", "amplitude_errors", "online", "control"),
     *("speed_accuracy", "which", "paper", "failure_map", "perturbations", "spectra", "rivals"),
-    *("referee", "fuzz", "mutation", "live", "instruments", "directions", "inexact"),
+    *("referee", "fuzz", "mutation", "live", "instruments", "directions", "inexact", "real"),
 )
 PLACES = {"rivals": "rivals.table"}  # modules of other names
 

@@ -69,6 +69,7 @@ CASES = {
         "growth of the page's memory [MB]",
     ),
     "noise": ("--drivers 2 --snr-db 60 --only white", "", "60 dB, white, dry: covered"),
+    "real": ("--data {}/none", "", "skipped: no recordings"),
     "online": (
         "--electrodes 4 --ticks 3 --hours 0.01 --output {}/online.csv", "online.csv",
         "wet skin that is found within 2 pulses",

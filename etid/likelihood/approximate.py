@@ -62,7 +62,7 @@ def approximated(load: Load, near: Near, start: Float[np.ndarray, "row q"]) -> A
         other = minimum(of, extended(of, start)[None])
         less = other.near.objective < least.near.objective
         least = select(far & less, other, least)
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if least.settled.any() else 1):
         near, changes = least.near, scores.changes(of, least.near)
         found = _restricted(of, near, changes, left)
         likely = (found.ratio > LIKELY) & (found.explained > MOST)

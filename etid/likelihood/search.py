@@ -40,6 +40,7 @@ from etid.signals.transfer import AnyArray, as_complex, frequency_variable, reci
 
 ROWS = 32  # loads side by side: more leave the cache of a processor, fewer cost calls
 POINTS = 100  # largest number of points; below 24 dB some fits take dozens
+FEWER = 20  # the same with δ, near which the search begins; those that settle take up to seven
 BEFORE = 0.05  # [standard errors] largest distance to the minimum before the last step
 # [standard errors] An approximation errs by a tenth: if a point so near is no better, the best
 # point is the minimum.
@@ -418,6 +419,7 @@ def _search(
     load: Load, starts: Float[AnyArray, "start *row q"], aside: Float[AnyArray, ""] | float
 ) -> Minimum:
     xp, at_knots = namespace(starts), load.gains.at(load.knots.index)
+    most = POINTS if load.gains.discrepancy is None else FEWER
     place = np.arange(starts.shape[-1])
     delays = (place >= load.gains.delays.start) & (place < load.gains.delays.stop)
 
@@ -432,7 +434,7 @@ def _search(
 
     def goes_on(state: _State) -> Bool[AnyArray, "*row"]:
         finite = xp.isfinite(state.near.objective) | (state.points == 0)
-        return ~state.settled & finite & (state.points < POINTS)
+        return ~state.settled & finite & (state.points < most)
 
     if xp is np:
         near = _likeliest(load, at_knots, starts)
