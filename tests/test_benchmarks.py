@@ -58,7 +58,8 @@ CASES = {
     "driver_order": ("--drivers 1 --snr-db 60 --orders 5 7 --data {}", "", "100 % right"),
     "fuzz": ("--files 3 --kind csv --output {}/f.json", "f.json", "0 faults in 3 files"),
     "inexact": (
-        "--drivers 1 --snr-db 60 --sizes 0.002 --lengths 1 --workers 1", "", "within 1.96 ±",
+        "--drivers 1 --snr-db 60 --sizes 0.002 --driver-sizes 0.005 --lengths 1 --workers 1", "",
+        "δ of Z_th 0.50%, length 1, damp: within 1.96 ±",
     ),
     "instruments": (
         "--quick --folder {0} --data {0}", "instruments.csv instruments.svg",

@@ -1,6 +1,7 @@
 """Refined Z_th: fits from several starts; the best result is kept and judged."""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -11,20 +12,22 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.starts import source_starts
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.likelihood import driver, of_calibrations
-from etid.likelihood.calibrations import Calibrations
+from etid.likelihood.approximate_driver import approximated, departs, needs_order
+from etid.likelihood.calibrations import Calibrations, Near
 from etid.likelihood.linear import inverse
-from etid.likelihood.noise import misses, shows_hum
+from etid.likelihood.noise import MISFIT_RRSE, misses, shows_hum
+from etid.likelihood.sandwich import Linear
 from etid.likelihood.source_prior import delay_std, delay_width
 from etid.precision import array_function, namespace, one_thread
 from etid.recordings.remarks import Remark
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.results.fit import complex_rrse
 from etid.results.instrument import Instrument
-from etid.results.verdicts import RESULTS, first_verdict
-from etid.signals import modal
+from etid.results.verdicts import RESULTS, first_verdict, left
+from etid.signals.harmonics import Spectrum
 from etid.signals.hold import DELAY, of_hold
 from etid.signals.knots import above_noise, banded
-from etid.signals.transfer import AnyArray, power
+from etid.signals.transfer import AnyArray, Rational, power
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
@@ -44,23 +47,32 @@ def is_split(source: SourceImpedance) -> Bool[AnyArray, "*start"]:
     return near.all(0).any(-1)
 
 
-@one_thread()
-@array_function
-def from_harmonics(
-    records: Harmonics,
-    r_load: Float[AnyArray, " record"],
-    order: int,
-    method: str,
-    instrument: Instrument | None,
-) -> HarmonicDriver:
-    """Refine Z_th by maximum likelihood.
+class _Best(NamedTuple):
+    """The best of several starts.
 
-    All harmonics are used of the bands in which V_th exceeds its noise.
+    Attributes:
+        model: The calibrations, with its Z_th.
+        near: The likelihood near the minimum.
+        least: The minimum.
+        start: Number of the start.
+        baseline: Z_th by Steiglitz-McBride.
     """
-    spectrum, r_load = jax.tree.map(np.asarray, (records.fields, r_load))
-    rate = np.asarray(records.sample_rate)[0]
-    bands = banded(spectrum)
-    spectra = above_noise(spectrum, bands)
+
+    model: Calibrations
+    near: Near
+    least: driver.Minimum
+    start: int
+    baseline: Rational
+
+
+def _best(
+    spectra: Spectrum,
+    bands: Spectrum,
+    r_load: Float[AnyArray, " record"],
+    rate: Float[AnyArray, ""],
+    order: int,
+    instrument: Instrument | None,
+) -> _Best:
     of_samples = spectra
     if spectra.held:  # a discrete filter takes the samples of the command
         hold = of_hold(spectra.frequency / rate)
@@ -84,26 +96,56 @@ def from_harmonics(
     passive = _is_passive(sources, inverse(least.matrix)[:, :kept, :kept], rate)
     costs = _cost(sources, driver.cost(model, least), passive)
     start = int(np.argmin(costs + np.where(least.settled, 0.0, UNWANTED)))
-    least = least._replace(points=least.points + steps)
-    least = driver.Minimum(*(of[start] for of in least))
-    model, near = model.at(least.q), model.near(least.q)
+    least = driver.Minimum(*(of[start] for of in least._replace(points=least.points + steps)))
+    model = model.at(least.q)
+    return _Best(model, model.near(least.q), least, start, baseline)
+
+
+@one_thread()
+@array_function
+def from_harmonics(
+    records: Harmonics,
+    r_load: Float[AnyArray, " record"],
+    order: int,
+    method: str,
+    instrument: Instrument | None,
+    accept: float,
+) -> HarmonicDriver:
+    """Refine Z_th by maximum likelihood.
+
+    All harmonics are used of the bands in which V_th exceeds its noise.
+
+    Where Z_th leaves more than noise, and so does a Z_th with one more section, all but chi2 and
+    rrse is that of a Z_th with a smooth error (`etid.likelihood.approximate_driver`).
+    """
+    spectrum, r_load = jax.tree.map(np.asarray, (records.fields, r_load))
+    rate = np.asarray(records.sample_rate)[0]
+    bands = banded(spectrum)
+    spectra = above_noise(spectrum, bands)
+    of = spectra, bands, r_load, rate, order, instrument
+    model, near, least, start, baseline = _best(*of)
     linear = model.linear(near)
-    cov = linear.first(model.unknowns).covariance()[:kept, :kept]  # at these errors
     statistic = np.nanmax(of_calibrations.missing_pole(model, near, linear))
-    calibration = model.calibration
-    if r_load.size > 1:
-        off = of_calibrations.mismatch(model, near, linear)
-        calibration = dataclasses.replace(calibration, mismatch=off.off, across=off.across)
+    calibration = _compared(model, near, linear)
     chi2 = 2 * least.objective / (model.terms - model.unknowns - model.unknown_states)
-    gains = near.profiles[0].gains  # of all calibrations; hum shows in harmonics that are not used
-    y = model.without_states(near.profiles)
-    squares = power(y - gains * spectra.x)
-    squares = squares / (spectra.variance_y + power(gains) * spectra.variance_x)
-    rrse = complex_rrse(gains * spectra.x, y, spectra.selected).max()
-    hum = shows_hum(squares, spectra.frequency[0], spectra.selected)
+    predicted, y = near.profiles[0].gains * spectra.x, model.without_states(near.profiles)
+    rrse = complex_rrse(predicted, y, spectra.selected).max()
+    too_low, hum = statistic > of_calibrations.MISSING_POLE, _hums(model, near)
+    inexact, wrong = False, _disagree(calibration, chi2, model.terms, statistic)
+    if accept > 0 and least.settled and not wrong and departs(model, near):
+        found = None if too_low and needs_order(model, near) else approximated(model, near)
+        if found is not None and found.explains:
+            inexact, too_low, points = True, np.bool_(False), least.points
+            model, near, least = found.model.at(found.least.q), found.near, found.least
+            least = least._replace(points=points + least.points)
+            linear, hum = model.linear(near), hum | _hums(model, near)
+            calibration = _compared(model, near, linear)
+    kept = model.parameters(least.q).size
+    cov = linear.first(model.unknowns).covariance()[:kept, :kept]  # at these errors
     passive = _is_passive(model.source, cov, rate)
-    faults = _faults(chi2, rrse, least.settled, calibration, passive, model.terms, statistic)
-    too_low = statistic > of_calibrations.MISSING_POLE
+    rest = left(chi2, rrse)
+    missed = rest > accept if inexact else misses(chi2, rrse)
+    faults = _faults(chi2, missed, least.settled, calibration, passive, wrong)
     return HarmonicDriver(
         b=baseline.num,
         a=baseline.den,
@@ -116,7 +158,11 @@ def from_harmonics(
         remarks=np.where(hum, int(Remark.mains_hum), 0),
         source=model.source,
         calibration=calibration,
-        result=first_verdict(*faults, (too_low, RESULTS.order_too_low)),
+        result=first_verdict(
+            *faults,
+            (too_low, RESULTS.order_too_low),
+            (np.bool_(inexact and rest > MISFIT_RRSE), RESULTS.approximate),
+        ),
         method=method,
         spectra=spectra,
         instrument=instrument,
@@ -132,7 +178,7 @@ def _is_passive(
 ) -> Bool[AnyArray, "*start"]:
     """Whether Re Z_th is nowhere negative by more than its standard errors allow."""
     xp, frequency = namespace(cov), BAND * rate
-    z_th, slopes = modal.with_slopes(source.vector(), source.log_omega.shape[-1], frequency)
+    z_th, slopes = source.slopes(source.vector(), frequency)
     slope = slopes.real
     error = xp.sqrt(xp.maximum((slope * (cov @ slope)).sum(-2), 0.0))
     return (z_th.real + PASSIVE * error).min(-1) >= 0
@@ -148,27 +194,51 @@ def _cost(
     return xp.where(xp.isfinite(cost), cost, np.inf)
 
 
+def _compared(model: Calibrations, near: Near, linear: Linear) -> Calibration:
+    """The calibrations, with what each known resistor shows beside the others."""
+    if model.calibration.r_load.size == 1:
+        return model.calibration
+    off = of_calibrations.mismatch(model, near, linear)
+    return dataclasses.replace(model.calibration, mismatch=off.off, across=off.across)
+
+
+def _hums(model: Calibrations, near: Near) -> Bool[AnyArray, ""]:
+    """Whether the residual of a calibration shows hum."""
+    # Gains are those of all calibrations; hum shows in harmonics that are not used.
+    s, gains = model.spectra, near.profiles[0].gains
+    squares = power(model.without_states(near.profiles) - gains * s.x)
+    squares = squares / (s.variance_y + power(gains) * s.variance_x)
+    return shows_hum(squares, s.frequency[0], s.selected)
+
+
+def _disagree(
+    of: Calibration,
+    chi2: Float[AnyArray, ""],
+    terms: Float[AnyArray, ""],
+    missing_pole: Float[AnyArray, ""],
+) -> Bool[AnyArray, ""]:
+    """Whether the resistors show different impedances."""
+    if of.mismatch is None or of.across is None:
+        return np.bool_(False)
+    wrong = of_calibrations.disagree(of.mismatch, chi2, terms)
+    return wrong | of_calibrations.bridged(of.across, chi2, terms, missing_pole)
+
+
 def _faults(
     chi2: Float[AnyArray, ""],
-    rrse: Float[AnyArray, ""],
+    missed: Bool[AnyArray, ""],
     settled: Bool[AnyArray, ""],
     calibration: Calibration,
     passive: Bool[AnyArray, ""],
-    terms: Float[AnyArray, ""],
-    missing_pole: Float[AnyArray, ""] | None = None,
+    wrong: Bool[AnyArray, ""],
 ) -> list[tuple[Bool[AnyArray, ""], RESULTS]]:
     """What is wrong with a driver, the worst first."""
     xp = namespace(chi2)
-    wrong = xp.bool_(False)
-    if calibration.mismatch is not None:
-        wrong = of_calibrations.disagree(calibration.mismatch, chi2, terms)
-    if calibration.across is not None and missing_pole is not None:
-        wrong = wrong | of_calibrations.bridged(calibration.across, chi2, terms, missing_pole)
     late = (xp.abs(calibration.delay_samples) > 1).any()  # the model holds up to one sample
     return [
         (~xp.isfinite(chi2), RESULTS.unstable),
         (wrong, RESULTS.resistors_disagree),
         (~passive, RESULTS.nonphysical),
         (~settled, MAX_STEPS_REACHED),
-        (misses(chi2, rrse) | late, RESULTS.misfit),
+        (missed | late, RESULTS.misfit),
     ]

@@ -229,7 +229,10 @@ def _aligned(
     driver = _identified(records, r_load, order, estimator, instrument)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
     # elsewhere.
-    if isinstance(records, Harmonics) and (may_hum(driver) or driver.verdict != "successful"):
+    doubtful = may_hum(driver) or driver.verdict != "successful"
+    if driver.inexact:  # its residual is noise, and so is that of hum
+        doubtful = bool(int(driver.remarks) & Remark.mains_hum)
+    if isinstance(records, Harmonics) and doubtful:
         few = records.without_mains()
         if few is not None:
             driver = better_of(driver, _identified(few, r_load, order, estimator, instrument))

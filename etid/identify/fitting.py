@@ -330,11 +330,7 @@ def refitted_loads(
 def may_hum(fit: Fit | Driver) -> Bool[np.ndarray, "*lane"]:
     """Whether a fit shows hum, or misses the recording for any reason."""
     hum = (np.asarray(fit.remarks) & Remark.mains_hum) > 0
-    return np.asarray(hum | ~(np.asarray(fit.chi2) < MISFIT_CHI2) | _inexact(fit))
-
-
-def _inexact(found: Fit | Driver) -> Any:
-    return found.inexact if isinstance(found, Fit) else False
+    return np.asarray(hum | ~(np.asarray(fit.chi2) < MISFIT_CHI2) | fit.inexact)
 
 
 def better_of(first: _Outcome, second: _Outcome) -> _Outcome:
@@ -342,7 +338,7 @@ def better_of(first: _Outcome, second: _Outcome) -> _Outcome:
 
     The second fit is the one without the mains harmonics.
     """
-    explains = second.verdict == "successful" and not _inexact(second)
+    explains = second.verdict == "successful" and not second.inexact
     if explains and int(second.remarks) & Remark.mains_hum:
         return second
     return _without_hum(first)

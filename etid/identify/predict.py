@@ -73,8 +73,9 @@ def predict(
         feed = untraced(serving(feed, ContinuousDriver, MAXIMUM_LIKELIHOOD.name))
     # Disturbed periods are predicted too.
     seen, simulated = Inspected(Inspection([recording])), load.impedance().has_response
+    simple = load.is_rational and not (isinstance(feed, Driver) and feed.inexact)
     periodic = seen.whole_periods[0] > 0 and not seen.is_held
-    if not load.is_rational and (periodic or not simulated):
+    if not simple and (periodic or not simulated):
         if not seen.is_held and isinstance(feed, ContinuousDriver):
             return _predict_periods(Inspected.of(recording), feed, load)
         if not simulated:

@@ -149,7 +149,8 @@ class Calibrations:
 
     @functools.cached_property
     def _of_source(self) -> int:
-        return 1 + modal.SECTION * self._sections + 2 * self.source.log_omega_real.shape[0]
+        delta = self.source.departure
+        return self.source.modes + (0 if delta is None else delta.coefficients.shape[0])
 
     @functools.cached_property
     def _sections(self) -> int:
@@ -303,7 +304,7 @@ class Calibrations:
         self, common: Float[AnyArray, "*row common"], f: Float[AnyArray, "record bin"]
     ) -> Complex[AnyArray, "*row record bin"]:
         """The gains without delays."""
-        z_th = modal.impedance(self.parameters(common)[..., None, :], self._sections, f)
+        z_th = self.source.impedance(self.parameters(common), f)
         return self._without_delays(common, f, z_th)[0]
 
     def _without_delays(
@@ -361,10 +362,9 @@ class Calibrations:
     ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
         """Z_th, the gains without delays, their derivatives by Z_th, and by all but the delays."""
         xp = namespace(common, self.spectra.x)
-        of = self.parameters(common)[..., None, :], self._sections, f
-        z_th, by_source = modal.with_slopes(*of)
+        z_th, by_source = self.source.slopes(self.parameters(common), f)
         gains, by_z, by_error = self._without_delays(common, f, z_th)
-        rows = [xp.moveaxis(by_source, -2, -3) * by_z[..., None, :, :]]
+        rows = [by_source * by_z[..., None, :, :]]
         rows += [] if by_error is None else [by_error]
         return z_th, gains, by_z, xp.concatenate(rows, -3)
 
@@ -397,7 +397,7 @@ class Calibrations:
             cov=xp.diag(zero),
             delay_width=xp.asarray(self.delay_width),
             tolerances=tolerances,
-            decays=modal.decays(source.vector(), self._sections, frequency),
+            decays=modal.decays(source.vector()[: source.modes], self._sections, frequency),
         )
 
     @array_function
@@ -464,13 +464,12 @@ class Calibrations:
         self, common: Float[AnyArray, "*row common"]
     ) -> tuple[Float[AnyArray, "*row term"], Float[AnyArray, "*row common term"]]:
         """The terms of the weak priors and their derivatives."""
-        xp, kept, size = namespace(common), self._of_source, common.shape[-1]
-        terms, by_source = self.prior.with_slopes(self.parameters(common))
+        xp, kept, size = namespace(common), self.source.modes, common.shape[-1]
+        terms, by_source = self.prior.with_slopes(common[..., :kept])
         none = xp.zeros((*common.shape[:-1], size - kept, terms.shape[-1]))
-        others = np.ones(size - kept)
-        others = xp.concatenate(
-            [others[: self.unknowns - kept] / self.delay_width, others[self.unknowns - kept :]]
-        )
+        ends = self._of_source - kept, self.unknowns - kept
+        first, delays, errors = np.split(np.ones(size - kept), ends)
+        others = xp.concatenate([first, delays / self.delay_width, errors])
         rows = np.eye(size)[:, kept:] * others + xp.zeros((*common.shape, 1))
         terms = xp.concatenate([terms, common[..., kept:] * others], -1)
         return terms, xp.concatenate([xp.concatenate([by_source, none], -2), rows], -1)

@@ -7,7 +7,7 @@ covariance (Jᵀ C J in place of Jᵀ J, White 1980) therefore uses the variance
 from jaxtyping import Bool, Float
 
 from etid.precision import namespace
-from etid.results.fit import left
+from etid.results.verdicts import left
 from etid.signals.harmonics import local_sum
 from etid.signals.mains import lines
 from etid.signals.transfer import AnyArray
@@ -70,7 +70,9 @@ def misses(
     return (chi2 > limit) & (left(chi2, error) > least)
 
 
-def is_smooth(terms: Float[AnyArray, "*row part"], parameters: int) -> Bool[AnyArray, "*row"]:
+def is_smooth(
+    terms: Float[AnyArray, "*row part"], parameters: int, limit: float = SMOOTH
+) -> Bool[AnyArray, "*row"]:
     """Whether a residual is smooth in frequency and more than noise.
 
     Condensed to the knots it keeps its squares, while those of noise become few.
@@ -78,5 +80,6 @@ def is_smooth(terms: Float[AnyArray, "*row part"], parameters: int) -> Bool[AnyA
     Args:
         terms: The condensed terms at the minimum; 0 where nothing is known.
         parameters: Number of parameters of the fit.
+        limit: Their χ², from which on it is smooth.
     """
-    return (terms**2).sum(-1) > SMOOTH * ((terms != 0).sum(-1) - parameters)
+    return (terms**2).sum(-1) > limit * ((terms != 0).sum(-1) - parameters)

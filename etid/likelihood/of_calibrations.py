@@ -56,6 +56,12 @@ BRIDGE = 0.25e-12
 EXPLAINED = 0.5
 
 
+def grid(lowest: Float[AnyArray, ""], highest: Float[AnyArray, ""]) -> Float[AnyArray, " pole"]:
+    """Frequencies of the sections [Hz] for a band."""
+    lowest = lowest / BEYOND
+    return lowest * (highest * BEYOND / lowest) ** np.linspace(0.0, 1.0, GRID)
+
+
 @array_function
 def sections(
     frequency: Float[AnyArray, " frequency"], highest: Float[AnyArray, ""]
@@ -66,9 +72,8 @@ def sections(
         frequency: Frequencies [Hz].
         highest: End of the band, which begins with the first frequency [Hz].
     """
-    xp, lowest = namespace(frequency), frequency[0] / BEYOND
-    grid = lowest * (highest * BEYOND / lowest) ** np.linspace(0.0, 1.0, GRID)
-    x = xp.tile(frequency[None, :] / grid[:, None], (len(DAMPINGS), 1))
+    xp, at = namespace(frequency), grid(frequency[0], highest)
+    x = xp.tile(frequency[None, :] / at[:, None], (len(DAMPINGS), 1))
     zeta = np.repeat(DAMPINGS, GRID)[:, None]
     by_g = 1 / (1 - x * x + 2j * zeta * x)
     return xp.stack([by_g, 1j * x * by_g], axis=1)
@@ -96,6 +101,16 @@ def missing_pole(
     more = of_priors @ others.reshape(s.shape[0], 2, -1).swapaxes(-1, -2)
     aa, ab, bb = aa + more[:, 0, 0], ab + more[:, 0, 1], bb + more[:, 1, 1]
     return (s * s * bb - 2 * s * t * ab + t * t * aa) / (aa * bb - ab * ab)
+
+
+def likeliest_section(
+    calibrations: Calibrations, near: Near, linear: Linear
+) -> Float[np.ndarray, "2"]:
+    """ω [rad/s] and ζ of the section that the score test shows best, in NumPy."""
+    spectra = calibrations.spectra
+    best = np.nanargmax(missing_pole(calibrations, near, linear))
+    f = grid(spectra.frequency[0, 0], spectra.frequency[spectra.selected].max())
+    return np.array([2 * np.pi * f[best % GRID], DAMPINGS[best // GRID]])
 
 
 class Mismatch(NamedTuple):

@@ -41,11 +41,13 @@ class Restricted(NamedTuple):
 
     Attributes:
         covariance: Mean covariance of δ between the nodes.
+        shown: Likelihood ratio of δ.
         ratio: Likelihood ratio of each change.
         explained: Part of the squares that δ explains, which each change explains without δ.
     """
 
     covariance: Float[np.ndarray, "row node node"]
+    shown: Float[np.ndarray, " row"]
     ratio: Float[np.ndarray, "row change"]
     explained: Float[np.ndarray, "row change"]
 
@@ -103,7 +105,7 @@ def restricted(
     value, scores, left_over = _marginal(whole[:, None], *of, count)
     ratio = (scores - (value - best[:, None])[..., None]).max(1)
     explained = left_over[:, 0] - squares.reshape(len(best), -1).min(1)
-    return Restricted(covariance, ratio, scores[:, 0] / explained[:, None])
+    return Restricted(covariance, value[:, 0] - best, ratio, scores[:, 0] / explained[:, None])
 
 
 def _marginal(

@@ -22,7 +22,7 @@ import math
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from etid.precision import array_function, namespace
 from etid.results.feed import SourceImpedance
@@ -130,11 +130,14 @@ def delay_width(
     return xp.minimum(delay * sample_rate, DELAY_WIDTH)
 
 
+def same_load(r_load: Float[AnyArray, " record"]) -> Bool[AnyArray, ""]:
+    """Whether calibrations have the same resistor."""
+    return r_load.max() - r_load.min() < SAME_LOAD * r_load.mean()
+
+
 def delay_std(r_load: Float[AnyArray, " record"]) -> Float[AnyArray, ""]:
     """Standard deviation of the delay of calibrations with these resistors [samples].
 
     Records with the same resistor do not determine their delay. Different resistors determine it.
     """
-    xp = namespace(r_load)
-    same = r_load.max() - r_load.min() < SAME_LOAD * r_load.mean()
-    return xp.where(same, DELAY_WIDTH, KNOWN_DELAY)
+    return namespace(r_load).where(same_load(r_load), DELAY_WIDTH, KNOWN_DELAY)

@@ -21,7 +21,7 @@ from etid.recordings.remarks import texts
 from etid.recordings.study import Study
 from etid.results.feed import AbstractFeed, Load, SourceImpedance
 from etid.results.instrument import Instrument
-from etid.results.verdicts import RESULTS, message
+from etid.results.verdicts import RESULTS, leaving, message
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import AnyArray, Rational, delay_variable, reciprocal
 
@@ -149,6 +149,16 @@ class Driver(AbstractFeed):
         """Number of poles."""
         return self.a.shape[0] - 1
 
+    @property
+    def inexact(self) -> bool:
+        """Whether Z_th leaves more than noise; the standard errors then contain it."""
+        return False
+
+    @property
+    def leaves(self) -> str:
+        """A sentence on what Z_th leaves, if ± contain it; otherwise empty."""
+        return leaving("Z_th", self.chi2, self.rrse) if self.usable and self.inexact else ""
+
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the calibrations; `etid.read_driver` identifies the driver from them again.
 
@@ -227,6 +237,8 @@ class Driver(AbstractFeed):
 
     def _numbers(self) -> str:
         """A sentence with the numbers that explain the verdict; empty if there are none."""
+        if self.verdict == "approximate":
+            return self.leaves
         if self.verdict == "misfit":
             return f"chi2 is {rounded(float(self.chi2), 3)}; noise alone gives 1."
         if self.verdict == "implausible":
@@ -244,7 +256,8 @@ class Driver(AbstractFeed):
             ("|Z_th| at 1 kHz", plus_minus(abs(z) / 1e3, of_size * abs(z) / 1e3), "kΩ"),
             ("its phase", plus_minus(*np.degrees((np.angle(z), of_phase)).tolist()), "°"),
         ]
-        notes = [*self._findings(), *([message(verdict)] if verdict != "successful" else [])]
+        why = [] if verdict == "successful" else [message(verdict)]
+        notes = [*self._findings(), *why, *filter(None, [self.leaves])]
         return Overview(
             f"Driver of order {self.order}: {verdict} in {several(int(self.steps), 'step')} "
             f"({self.method}), {quality(float(self.rrse), float(self.chi2))}",
@@ -294,6 +307,11 @@ class ContinuousDriver(Driver):
     start: Int[AnyArray, ""] = eqx.field(default_factory=lambda: np.array(0))
 
     @property
+    def inexact(self) -> bool:
+        """Whether Z_th leaves more than noise; the standard errors then contain it."""
+        return self.source.departure is not None
+
+    @property
     def drift(self) -> Float[Array | np.ndarray, ""] | None:
         """Relative standard deviation of the change of each parameter of `source` until a skin.
 
@@ -309,10 +327,11 @@ class ContinuousDriver(Driver):
         """
         # Frequencies, dampings and R are stored as logarithms, so their changes are relative.
         vector = self.source.vector()
-        relative = np.isin(np.arange(vector.shape[0]), self.source.gains)
+        place, xp = np.arange(vector.shape[0]), namespace(vector)
         own = 0.0 if self.drift is None else self.drift
-        xp = namespace(vector)
-        return xp.where(relative, xp.abs(vector), 1.0) * (own if drift is None else drift)
+        size = xp.where(np.isin(place, self.source.gains), xp.abs(vector), 1.0)
+        size = xp.where(place < self.source.modes, size, 0.0)  # a departure does not drift
+        return size * (own if drift is None else drift)
 
     def later_cov(self) -> Float[AnyArray, "parameter parameter"]:
         """Covariance of the parameters of `source` at the time when a skin is recorded."""

@@ -26,6 +26,7 @@ from etid.circuits.overview import Overview
 from etid.precision import Module, in_float64, namespace, untraced
 from etid.results.verdicts import RESULTS, Judged, verdict
 from etid.signals import modal
+from etid.signals.departure import Departure
 from etid.signals.filtering import StateSpace
 from etid.signals.transfer import AnyArray, Rational
 
@@ -70,6 +71,9 @@ class SourceImpedance(Module):
     with R < 0 the driver could not be loaded with a capacitor. ζ > 1 is a pair of real poles. Order
     n has ⌊(n−1)/2⌋ sections, because a transformer always has one slow real pole: its magnetising
     inductance.
+
+    Where no order explains the calibrations, Z_th is this times e^δ: `departure`, a smooth function
+    of frequency whose coefficients are further parameters. In time it has no effect.
     """
 
     log_resistance: Float[AnyArray, "*row"]
@@ -79,6 +83,7 @@ class SourceImpedance(Module):
     slope: Float[AnyArray, "*row section"]
     log_omega_real: Float[AnyArray, "*row real"]
     gain_real: Float[AnyArray, "*row real"]
+    departure: Departure | None = None
 
     @property
     def order(self) -> int:
@@ -87,29 +92,62 @@ class SourceImpedance(Module):
 
     def vector(self) -> Float[AnyArray, "*row parameter"]:
         """All parameters in field order, of one source or of several that are stacked."""
-        first, *rest = untraced([getattr(self, one.name) for one in dataclasses.fields(self)])
+        names = [one.name for one in dataclasses.fields(self) if one.name != "departure"]
+        first, *rest = untraced([getattr(self, name) for name in names])
+        rest += [] if self.departure is None else [untraced(self.departure.coefficients)]
         return namespace(first, *rest).concatenate([first[..., None], *rest], -1)
+
+    @property
+    def modes(self) -> int:
+        """Number of parameters of the modal form, which come first."""
+        return 1 + modal.SECTION * self.log_omega.shape[-1] + 2 * self.log_omega_real.shape[-1]
 
     def of_vector(self, vector: Float[AnyArray, " parameter"]) -> "SourceImpedance":
         """A source of the same order with these parameters."""
-        pairs = self.log_omega.shape[0]
-        ends = np.cumsum([1, *[pairs] * modal.SECTION, self.log_omega_real.shape[0]])
-        first, *rest = (vector[a:b] for a, b in zip([0, *ends], [*ends, None], strict=True))
-        return SourceImpedance(first[0], *rest)
+        pairs, reals, delta = self.log_omega.shape[0], self.log_omega_real.shape[0], self.departure
+        ends = np.cumsum([1, *[pairs] * modal.SECTION, reals, reals])
+        first, *rest = (vector[a:b] for a, b in zip([0, *ends[:-1]], ends, strict=True))
+        if delta is not None:
+            delta = dataclasses.replace(delta, coefficients=vector[self.modes :])
+        return SourceImpedance(first[0], *rest, departure=delta)
 
     @in_float64
     def response(self, frequency: Quantity) -> Complex[AnyArray, "..."]:
         """Impedance [Ω] at real frequencies [Hz], an array of NumPy unless JAX traces it."""
         of, at = self.vector(), untraced(frequency)
         at = namespace(of, at).asarray(at, float)
-        found = modal.impedance(of, self.log_omega.shape[0], at.reshape(-1))
-        return found.reshape(at.shape)
+        return self.impedance(of, at.reshape(-1)).reshape(at.shape)
+
+    def impedance(
+        self, parameters: Float[AnyArray, "*row parameter"], frequency: Float[AnyArray, "*bin"]
+    ) -> Complex[AnyArray, "..."]:
+        """Impedance [Ω] with other parameters (*row *bin)."""
+        wide = _wide(parameters[..., : self.modes], frequency)
+        found = modal.impedance(wide, self.log_omega.shape[-1], frequency)
+        if self.departure is None:
+            return found
+        return found * self.departure.factor(parameters[..., self.modes :], frequency)
 
     def with_slopes(
         self, frequency: Float[AnyArray, " frequency"]
     ) -> tuple[Complex[AnyArray, " frequency"], Complex[AnyArray, "parameter frequency"]]:
         """`response`, and its derivatives with respect to the parameters, in field order."""
-        return modal.with_slopes(self.vector(), self.log_omega.shape[0], untraced(frequency))
+        return self.slopes(self.vector(), untraced(frequency))
+
+    def slopes(
+        self, parameters: Float[AnyArray, "*row parameter"], frequency: Float[AnyArray, "*bin"]
+    ) -> tuple[Complex[AnyArray, "..."], Complex[AnyArray, "..."]]:
+        """`impedance`, and its derivatives with respect to the parameters (*row parameter *bin)."""
+        wide, axis = _wide(parameters[..., : self.modes], frequency), -1 - frequency.ndim
+        z, by_mode = modal.with_slopes(wide, self.log_omega.shape[-1], frequency)
+        xp = namespace(z)
+        by_mode = xp.moveaxis(by_mode, -2, axis)
+        if self.departure is None:
+            return z, by_mode
+        by = self.departure.factor(parameters[..., self.modes :], frequency)
+        z, by_mode = z * by, by_mode * xp.expand_dims(by, axis)
+        of_delta = xp.expand_dims(z, axis) * self.departure.by_coefficient(frequency)
+        return z, xp.concatenate([by_mode, of_delta], axis)
 
     @property
     def log_omegas(self) -> Int[np.ndarray, " pole"]:
@@ -153,6 +191,13 @@ class SourceImpedance(Module):
         B, share = both.B / total, z2.D[0] / total
         C = xp.concatenate([np.zeros(z1.C.size), z2.C]) - share * both.C
         return StateSpace(both.A - B * both.C[None, :], B, C, share[None])
+
+
+def _wide(
+    parameters: Float[AnyArray, "*row parameter"], frequency: Float[AnyArray, "*bin"]
+) -> Float[AnyArray, "..."]:
+    """Parameters with axes for all but the last axis of the frequencies."""
+    return parameters[(..., *[None] * (frequency.ndim - 1), slice(None))]
 
 
 class CurrentSource(Module):

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import Circuit
 from etid.circuits.directions import ALIKE, DIRECTIONS, FAST, SPREAD, Direction, named
-from etid.circuits.display import per_cent, quality, quantity, rounded, several
+from etid.circuits.display import quality, quantity, rounded, several
 from etid.circuits.overview import Overview, element_rows
 from etid.precision import Module, namespace
 from etid.recordings.remarks import texts, words
@@ -23,7 +23,7 @@ from etid.results.data import HasSource
 from etid.results.instrument import Effects, largest
 from etid.results.method_options import without_known
 from etid.results.posterior import tails
-from etid.results.verdicts import RESULTS, Judged, counted, message
+from etid.results.verdicts import RESULTS, Judged, counted, leaving, message
 from etid.signals.transfer import AnyArray, power
 
 
@@ -49,12 +49,6 @@ def complex_rrse(
     xp = namespace(predicted, measured)
     missed = xp.where(used, power(measured - predicted), 0.0).sum(-1)
     return xp.sqrt(missed / xp.where(used, power(measured), 0.0).sum(-1))
-
-
-def left(chi2: Float[AnyArray, "*row"], error: Float[AnyArray, "*row"]) -> Float[AnyArray, "*row"]:
-    """What a model leaves beyond the noise, from χ² and RRSE; relative to the signal, too."""
-    xp = namespace(chi2, error)
-    return error * xp.sqrt(xp.maximum(1 - 1 / chi2, 0.0))
 
 
 class IdentificationError(RuntimeError):
@@ -259,10 +253,7 @@ class Fit(Judged, HasSource[Circuit]):
         """A sentence on what the circuit leaves, if ± contain it; otherwise empty. For one fit."""
         if not (self.usable and self.inexact):
             return ""
-        part = float(left(np.asarray(self.chi2), np.asarray(self.rrse)))
-        # Over all harmonics the noise may hide it.
-        size = f"{per_cent(part)} of the signal" if part > 0 else "less than the noise"
-        return f"The circuit leaves {size}; ± contain it."
+        return leaving("The circuit", self.chi2, self.rrse)
 
     @property
     def stderr(self) -> Circuit:

@@ -18,7 +18,7 @@ from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.errors import install
 from etid.recordings.fields import DESCRIBING, Label, check_names, wanted_labels
 from etid.results.data import with_data
-from etid.results.fit import Fit, Support, left
+from etid.results.fit import Fit, Support
 from etid.results.fits_columns import (
     DESCRIBED,
     LABELS,
@@ -30,7 +30,7 @@ from etid.results.fits_columns import (
 )
 from etid.results.hdf5_table import Table, opened_table, write_table
 from etid.results.instrument import Effects
-from etid.results.verdicts import counted, counts
+from etid.results.verdicts import counted, counts, left
 
 AND = " + "  # between the names of estimators
 

@@ -40,6 +40,7 @@ from etid.results.fits import SCHEMA, VERSION, Fits
 from etid.results.hdf5_table import REMEDY, Table, opened_table, write_table
 from etid.results.instrument import TOLERANCES, Instrument
 from etid.results.verdicts import verdicts_of
+from etid.signals.departure import Departure
 
 # |Z_th| [Ω] at 1 kHz: from the transformer of a microphone to the transformer of a tube.
 PLAUSIBLE = (300.0, 300e3)
@@ -284,6 +285,15 @@ def _lists(module: Any, *names: str) -> dict[str, Any]:
     }
 
 
+def _source(source: SourceImpedance) -> dict[str, Any]:
+    """Z_th; without `departure` where a driver has none."""
+    stored = _lists(dataclasses.replace(source, departure=None))
+    del stored["departure"]
+    if source.departure is not None:
+        stored["departure"] = _lists(source.departure)
+    return stored
+
+
 def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
     stored = {
         "calibrations": paths,
@@ -297,7 +307,7 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
             **_lists(driver, "cov"),
             **_lists(driver.calibration, "r_load", "delay_samples", "delay_std_samples", "errors"),
             "instrument": None if driver.instrument is None else driver.instrument.stored(),
-            "source": _lists(driver.source),
+            "source": _source(driver.source),
             "tried": _lists(driver.tried),
         }
     return json.dumps(stored)
@@ -330,12 +340,17 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
     own = stored["source"]
     pairs = _numbers(own, "log_omega", None).size
     reals = _numbers(own, "log_omega_real", None).size
-    source = SourceImpedance(
-        log_resistance=_numbers(own, "log_resistance"),
-        **{name: _numbers(own, name, pairs) for name in ("log_omega", "log_zeta", "gain", "slope")},
-        **{name: _numbers(own, name, reals) for name in ("log_omega_real", "gain_real")},
-    )
-    size = 1 + 4 * pairs + 2 * reals
+    counts = dict.fromkeys(("log_omega", "log_zeta", "gain", "slope"), pairs)
+    counts |= dict.fromkeys(("log_omega_real", "gain_real"), reals)
+    parts: dict[str, Any] = {name: _numbers(own, name, count) for name, count in counts.items()}
+    source = SourceImpedance(log_resistance=_numbers(own, "log_resistance"), **parts)
+    size = source.modes
+    if "departure" in own:
+        told = own["departure"]
+        ends, functions = _numbers(told, "ends", 2), _numbers(told, "functions", None, None)
+        coefficients = _numbers(told, "coefficients", 2 * functions.shape[1])
+        delta = Departure(ends, functions, coefficients)
+        source, size = dataclasses.replace(source, departure=delta), size + coefficients.size
     r_load = _numbers(stored, "r_load", None)
     delays = _numbers(stored, "delay_samples", r_load.size), _numbers(stored, "delay_std_samples")
     instrument, told = None, stored["instrument"]

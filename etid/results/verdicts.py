@@ -14,8 +14,9 @@ import jax
 import jax.core
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from etid.circuits.display import per_cent
 from etid.circuits.overview import Overviewed
 from etid.precision import Module, namespace
 from etid.signals.transfer import AnyArray
@@ -51,8 +52,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "residual."
     )
     approximate = (
-        "The circuit is not exact, and no other circuit or fault that has a name explains what it "
-        "leaves beyond the noise. If ± are too large, look at the residual by frequency."
+        "The circuit, or Z_th of a driver, is not exact, and nothing that has a name explains what "
+        "it leaves beyond the noise. If ± are too large, look at the residual by frequency."
     )
     changed = (
         "The load or the driver changed during the record: the pulse periods differ by more than "
@@ -136,6 +137,20 @@ USABLE = ("successful", "approximate")
 """Verdicts of results that can be used: their standard errors hold."""
 
 _NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+
+
+def left(chi2: Float[AnyArray, "*row"], error: Float[AnyArray, "*row"]) -> Float[AnyArray, "*row"]:
+    """What a model leaves beyond the noise, from χ² and RRSE; relative to the signal, too."""
+    xp = namespace(chi2, error)
+    return error * xp.sqrt(xp.maximum(1 - 1 / chi2, 0.0))
+
+
+def leaving(model: str, chi2: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
+    """A sentence on what a model leaves, if ± contain it."""
+    part = float(left(np.asarray(chi2), np.asarray(error)))
+    # Over all harmonics the noise may hide it.
+    size = f"{per_cent(part)} of the signal" if part > 0 else "less than the noise"
+    return f"{model} leaves {size}; ± contain it."
 
 
 def verdict(name: str) -> RESULTS:

@@ -162,7 +162,7 @@ class MaximumLikelihood(AbstractEstimator):
         instrument: Instrument | None,
     ) -> Driver:
         """Identify a driver: Z_th and the trigger delays of its calibrations."""
-        return from_harmonics(records, r_load, order, str(self), instrument)
+        return from_harmonics(records, r_load, order, str(self), instrument, self.accept)
 
     def known(
         self,

@@ -20,8 +20,8 @@ from etid.likelihood.linear import diagonal
 from etid.likelihood.noise import MISFIT_RRSE, misses
 from etid.precision import namespace
 from etid.recordings.remarks import Remark
-from etid.results.fit import Fit, Limited, left
-from etid.results.verdicts import RESULTS, first_reason, usable
+from etid.results.fit import Fit, Limited
+from etid.results.verdicts import RESULTS, first_reason, left, usable
 from etid.signals.transfer import AnyArray
 
 ACCEPT = 0.02  # of the signal: a circuit that leaves more is the wrong one

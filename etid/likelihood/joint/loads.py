@@ -16,7 +16,6 @@ from etid.likelihood.search import ROWS, Load
 from etid.likelihood.shared import Calibrated, Unloaded
 from etid.likelihood.source import Source
 from etid.precision import namespace
-from etid.signals import modal
 from etid.signals.knots import DENSITY, knots
 from etid.signals.transfer import AnyArray, as_complex, reciprocal
 
@@ -116,7 +115,7 @@ class Signals:
     def __call__(self, common: Float[AnyArray, "*row common"]) -> AnyArray:
         """The signals, each at all knots (*row change)."""
         of = self.calibrations
-        z_th = modal.impedance(*self._source(common))
+        z_th = of.source.impedance(of.parameters(common), self.frequency)
         w = namespace(z_th).log(z_th + as_complex(of.calibration.r_load.mean()))
         known = None if self.loads.same is None else of.gains(common, of.knots)
         return self._all(_parts(w[..., None, :]), of.errors(common), known)
@@ -124,7 +123,7 @@ class Signals:
     def slopes(self, common: Float[AnyArray, "*row common"]) -> AnyArray:
         """Derivatives of the signals (*row common change)."""
         of, xp = self.calibrations, namespace(common)
-        z_th, rows = modal.with_slopes(*self._source(common))
+        z_th, rows = of.source.slopes(of.parameters(common), self.frequency)
         rows = rows * reciprocal(z_th + as_complex(of.calibration.r_load.mean()))[..., None, :]
         rest = common.shape[-1] - rows.shape[-2]
         none = xp.zeros((*rows.shape[:-2], rest, rows.shape[-1]), rows.dtype)
@@ -132,10 +131,6 @@ class Signals:
         known = None if self.loads.same is None else of.slopes(common, of.knots).by_q
         errors = np.eye(common.shape[-1]) + xp.zeros((*common.shape[:-1], 1, 1))
         return self._all(_parts(w), of.errors(errors), known)
-
-    def _source(self, common: Float[AnyArray, "*row common"]) -> tuple[AnyArray, int, AnyArray]:
-        of = self.calibrations
-        return of.parameters(common), of.source.log_omega.shape[0], self.frequency
 
     def _all(
         self, w: AnyArray, errors: AnyArray, known: Complex[AnyArray, "*row record knot"] | None
