@@ -126,6 +126,7 @@ def test_a_fault_of_one_record_is_refused_and_the_skin_itself_is_not():
         (slow_voltage, "dry", 50.0, 0.4, 1.0),
         (beside, "dry", 50.0, 0.95, 1.0),
         (compressed_current, "dry", 50.0, 0.9, 1.0),
+        (compressed_current, "damp", 60.0, 0.95, 1.0),
         (compressed_voltage, "damp", 40.0, 0.95, 1.0),
         (falling, "damp", 40.0, 0.95, 1.0),
     ],

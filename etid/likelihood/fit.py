@@ -24,7 +24,7 @@ from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex, power
 
 NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
-SHARE = 0.5  # of the excess of χ², from which on a falling resistance is named as its cause
+SHARE = 0.5  # of the excess of χ², which a change explains that is not smooth if it is the cause
 UNSURE = 4.0  # standard deviations of χ² that are no excess
 # Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
 # 200 fits were wrong by five standard errors; both exceed it.
@@ -119,6 +119,12 @@ def _approximated(
         (DIRECTIONS[name].seen(*exact.tested[name][:3]) & of.explains[name]).any(-1)
         for name in scores.named()
     ]
+    over = SHARE * (exact.chi2 - 1) * load.records.terms
+    for name in ("compressed current", "compressed voltage"):  # not smooth in frequency
+        if name in exact.tested:
+            one = exact.tested[name]
+            causes = DIRECTIONS[name].seen(*one[:3]) & (one.explained > over[:, None])
+            named.append(causes.any(-1))
     if load.gains.outputs.count > 1:  # outputs that contradict each other are not averaged
         named.append(exact.inconsistent)
     other = np.any(named, 0) | exact.falls | misses(found.chi2, found.rrse) | ~found.settled
