@@ -4,7 +4,11 @@ They are k fs/N of a record of N samples, with k = 1 … up to `ALIASED` of the 
 `etid.likelihood.transient` says what the states at both ends of the record make of them.
 
 **Noise.** Where the record holds several pulse periods, the bins between their harmonics show it
-(`etid.signals.noise`). Otherwise its quiet parts do.
+(`etid.signals.noise`). Otherwise its quiet parts do. A
+signal without rest, such as a random sequence, looks like noise then. But in a few neighbouring
+bins Y = G X + T with smooth G and T, and what polynomials for both leave is var Y + |G|² var X (the
+local polynomial method of Pintelon and Schoukens, 2012, chapter 7). If this is much less than the
+noise that the records seem to have, it counts, half of it for each record.
 
 **Aliases** of the edges of pulses fall on all bins, as on the harmonics of a period of whole
 samples (`etid.signals.harmonics`, which says how their size follows from the record). The band ends
@@ -34,6 +38,11 @@ UNKNOWN = 10.0
 # this part of its power at a third of the rate. Steps have 0.03 to 0.16 after a filter of fourth
 # order at 0.4 of the rate, and at most 0.007 after one of eighth order at 0.3.
 LAST, STEPS, SURE = 0.45, 0.015, 5.0
+
+
+LOCAL, DEGREE = 32, 2  # neighbouring bins, and degree of the polynomials of G and of T
+STRONG = 10.0  # power of a signal relative to the noise, from which on both records share the noise
+SEEMING = 2.0  # noise of both records relative to what polynomials leave, above which this counts
 
 
 class Bins(NamedTuple):
@@ -73,6 +82,8 @@ def bins(
     size = both.shape[-1]
     transform, count = harmonics_of(both, 1), math.ceil(ALIASED * size)
     variance, of_ends = _noise(both, noise, transform.shape[-1])
+    if noise is None:
+        variance = _of_both(transform, variance)
     variance = np.maximum(variance, least[:, None] ** 2 / size)
     for row in np.flatnonzero(coarse):
         variance[row] = rounding_variance(both[row], float(coarse[row]), 1, size)
@@ -104,6 +115,33 @@ def _noise(
     power = np.stack([np.interp(at, known, one) for one in np.asarray(of.power)])
     ends = np.stack([np.interp(at, known, one) > 0.5 for one in 1.0 * np.asarray(of.of_ends)])
     return power * (samples / size), ends
+
+
+def _of_both(
+    both: Complex[np.ndarray, "2 bin"], variance: Float[np.ndarray, "2 bin"]
+) -> Float[np.ndarray, "2 bin"]:
+    """The variances, or those by what Y = G X + T leaves with polynomials for G and T."""
+    groups = both.shape[-1] // LOCAL
+    if groups == 0:
+        return variance
+    x, y = both[:, : groups * LOCAL].reshape(2, groups, LOCAL)
+    powers = np.linspace(-1, 1, LOCAL) ** np.arange(DEGREE + 1)[:, None]
+    columns = np.concatenate(
+        [x[:, None] * powers, 1.0 * np.broadcast_to(powers, (groups, *powers.shape))], 1
+    )
+    basis = np.linalg.qr(columns.swapaxes(-1, -2))[0]
+    left = y - (basis @ (basis.conj().swapaxes(-1, -2) @ y[..., None]))[..., 0]
+    rest = LOCAL - 2 * (DEGREE + 1)
+    found = power(left).sum(-1) / (rest - 1)  # the mean of its inverse is right
+    explained = np.maximum(power(y).sum(-1) - LOCAL / rest * power(left).sum(-1), 0.0)
+    gain = explained / power(x).sum(-1)
+    seeming = variance[:, : groups * LOCAL].reshape(2, groups, LOCAL).mean(-1)
+    if not np.median((seeming[1] + gain * seeming[0]) / found) > SEEMING:
+        return variance
+    signal = explained > STRONG * LOCAL * found
+    of_x = np.where(signal, 0.5 * found / np.where(signal, gain, 1.0), seeming[0])
+    at = np.minimum(np.arange(both.shape[-1]) // LOCAL, groups - 1)
+    return np.stack([of_x, np.where(signal, 0.5, 1.0) * found])[:, at]
 
 
 def _tapered(both: Float[np.ndarray, "2 time"]) -> Complex[np.ndarray, "2 bin"]:
