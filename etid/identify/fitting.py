@@ -472,28 +472,25 @@ class Batch:
         """The fits of the best of these circuits, with their verdicts."""
         _, driver, estimator, _, shared = self.like
 
-        exact = estimator
-        if isinstance(estimator, MaximumLikelihood):
-            exact = dataclasses.replace(estimator, accept=0.0)
-
-        def alike(
-            lanes: Sequence[AbstractLane], circuit: AbstractCircuit, of: AbstractEstimator
-        ) -> Fit:
+        def alike(lanes: Sequence[AbstractLane], circuit: AbstractCircuit, inexact: bool) -> Fit:
+            of = estimator
+            if isinstance(of, MaximumLikelihood) and not inexact:
+                of = dataclasses.replace(of, accept=0.0)
             known = known_of(lanes[0], driver, shared, of)
             found = fits_of(lanes, driver, known, circuit, of)
-            if not isinstance(known, GivenDriver) or not has_open_resonance(driver):
-                return found
-            aside = dataclasses.replace(known, aside=np.asarray(ASIDE))
-            return likelier(found, fits_of(lanes, driver, aside, circuit, of))
+            if isinstance(known, GivenDriver) and has_open_resonance(driver):
+                aside = dataclasses.replace(known, aside=np.asarray(ASIDE))
+                found = likelier(found, fits_of(lanes, driver, aside, circuit, of))
+            return dataclasses.replace(found, method=str(estimator))
 
         def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit, inexact: bool) -> Fit:
             rows: dict[Any, list[int]] = {}  # those that are realigned may have other shapes
             for row, lane in enumerate(lanes):
                 rows.setdefault(lane.shapes, []).append(row)
-            of = estimator if inexact else exact
+            of = circuit, inexact
             if len(rows) == 1:
-                return alike(lanes, circuit, of)
-            parts = [alike([lanes[row] for row in each], circuit, of) for each in rows.values()]
+                return alike(lanes, *of)
+            parts = [alike([lanes[row] for row in each], *of) for each in rows.values()]
             whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
             return taken(whole, np.argsort(np.concatenate(list(rows.values()))))
 
