@@ -49,10 +49,10 @@ COVERED = 0.90, 0.97  # of 1.96 ±
 OPTIONS = (
     WORKERS,
     option("--snr-db", default=(40.0, 60.0, 80.0), metavar="DB"),
-    option("--sizes", default=SIZES),
+    option("--sizes", default=SIZES, nargs="*"),
     option("--lengths", default=LENGTHS),
     option("--drivers", default=40),
-    option("--driver-sizes", default=DRIVER_SIZES, help="of the error of Z_th"),
+    option("--driver-sizes", default=DRIVER_SIZES, nargs="*", help="of the error of Z_th"),
     option("--resistors", default=2, help="number of known resistors behind such a driver"),
     option("--parts", default=lab.PARTS, help="spread of the parts of the drivers"),
 )

@@ -32,7 +32,7 @@ from etid.signals.departure import Departure
 
 # χ² of the condensed terms, up to which no likelihood ratio is asked for; of good drivers it is 0.7
 PERHAPS = 0.78
-# Likelihood ratio of δ. Of a hundred good drivers at 40 to 80 dB the largest is 8.
+# Likelihood ratio of δ. Of 60 good drivers at 40 to 80 dB the largest is 8.
 SURE = 25.0
 ROUNDS = 2  # the size of δ is chosen again where its first choice has led
 STEPS = 60  # with one more section; what it explains is seen earlier
