@@ -203,12 +203,12 @@ class _Group:
                 errors = of.at + found.z @ of.by_z
             good = found.settled & np.isfinite(found.chi2) & ~misses(found.chi2, found.rrse)
             used = good & ~changed & ~found.other & ~(found.strain > STRAINED) & ~found.approximate
-            inexact: list[Fit | None] = [None] * len(changed)
+            own: list[Fit | None] = [None] * len(changed)
             if found.approximate.any():
                 fits = self._judged(found, changed)
                 for row in np.flatnonzero(found.approximate).tolist():
-                    inexact[row] = taken(fits, row)
-            signs = used, found.hum, found.falls, changed, found.other, inexact
+                    own[row] = taken(fits, row)
+            signs = used, found.hum, found.falls, changed, found.other, own
             parts.append(zip(found.logs, found.delays, errors, *signs, strict=True))
         each = itertools.chain.from_iterable(parts)
         return [_Start(lane, *numbers) for lane, numbers in zip(every, each, strict=True)]

@@ -83,7 +83,7 @@ class SourceImpedance(Module):
     slope: Float[AnyArray, "*row section"]
     log_omega_real: Float[AnyArray, "*row real"]
     gain_real: Float[AnyArray, "*row real"]
-    departure: Departure | None = None
+    departure: Departure | None = dataclasses.field(default=None, kw_only=True)
 
     @property
     def order(self) -> int:

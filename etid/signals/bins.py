@@ -80,7 +80,7 @@ def bins(
         of_current: Whether the first record is a current.
     """
     size = both.shape[-1]
-    transform, count = harmonics_of(both, 1), math.ceil(ALIASED * size)
+    transform, count = np.asarray(harmonics_of(both, 1)), math.ceil(ALIASED * size)
     variance, of_ends = _noise(both, noise, transform.shape[-1])
     if noise is None:
         variance = _of_both(transform, variance)
