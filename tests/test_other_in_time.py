@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 import etid
@@ -34,7 +35,8 @@ def identified(load, snr_db: float, samples: int, circuit=None, method="output_e
     [
         # A wrong circuit bends the valley, in which a fit may also spend its steps.
         (Cole(LOADS["damp"], 0.9), 40.0, ("misfit", "max_steps_reached")),
-        (TwoLayers(LOADS["dry"], 0.3), 40.0, ("misfit", "max_steps_reached")),
+        # A weak second layer may pass for any smooth error; ± contain it.
+        (TwoLayers(LOADS["dry"], 0.3), 40.0, ("misfit", "successful", "approximate")),
         *((LOADS[skin], snr_db, ("successful",)) for skin in LOADS for snr_db in (40.0, 80.0)),
     ],
 )
@@ -42,3 +44,8 @@ def test_output_error_sees_another_skin_and_only_that(load, snr_db, verdicts, me
     fit = identified(load, snr_db, 3334, method=method)
     assert fit.chi2 < 1.5 or verdicts == ("successful",)
     assert fit.verdict in verdicts
+    if fit.usable:
+        low = dataclasses.astuple(getattr(load, "elements", load))
+        z = (np.array(fit.circuit.values()) - low) / np.array(fit.stderr.values())
+        assert (np.abs(z) < 4).all()
+        assert fit.inexact == isinstance(load, TwoLayers)
