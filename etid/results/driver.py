@@ -242,7 +242,7 @@ class Driver(AbstractFeed):
         if self.verdict == "misfit":
             return f"chi2 is {rounded(float(self.chi2), 3)}; noise alone gives 1."
         if self.verdict == "implausible":
-            return f"|Z_th| is {abs(self._at_1_khz()):.4g} ohm at 1 kHz."
+            return f"|Z_th| is {np.abs(self._at_1_khz()):.4g} ohm at 1 kHz."
         return ""
 
     def _at_1_khz(self) -> complex:
@@ -251,9 +251,10 @@ class Driver(AbstractFeed):
     def _overview(self) -> Overview:
         at, verdict = jax.device_put(np.array([1e3])), self.verdict
         z = self._at_1_khz()
+        size = float(np.abs(z))  # `abs` raises where a number overflows
         of_size, of_phase = np.asarray(self.log_response_stderr(at))[:, 0].tolist()
         rows = [
-            ("|Z_th| at 1 kHz", plus_minus(abs(z) / 1e3, of_size * abs(z) / 1e3), "kΩ"),
+            ("|Z_th| at 1 kHz", plus_minus(size / 1e3, of_size * size / 1e3), "kΩ"),
             ("its phase", plus_minus(*np.degrees((np.angle(z), of_phase)).tolist()), "°"),
         ]
         why = [] if verdict == "successful" else [message(verdict)]
