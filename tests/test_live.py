@@ -349,10 +349,11 @@ def test_the_loop_waits_for_no_page_and_no_memory_grows(monkeypatch):
                 hand_over(number)
         finally:
             os.kill(pid, signal.SIGCONT)
-        # A snapshot is due at every sixth pulse of 16.7 ms. The processor's time of this thread, as
-        # other tests run beside it; one that waited for a frozen process would wait for ever.
+        # A snapshot is due at every sixth pulse of 16.7 ms; a tenth of that on any processor. The
+        # processor's time of this thread, as other tests run beside it; one that waited for a
+        # frozen process would wait for ever.
         taken, passed = np.array(seconds).reshape(2, 600, 2).transpose(2, 0, 1)
-        assert (np.median(taken, axis=1) < 4e-3).all(), np.median(taken, axis=1)
+        assert (np.median(taken, axis=1) < 10e-3).all(), np.median(taken, axis=1)
         assert passed.max() < 1.0
         maps = pathlib.Path(f"/proc/{view._process.pid}/maps").read_text()
         assert "jaxlib" not in maps, "the page's process takes no memory and cores of JAX"
