@@ -194,7 +194,7 @@ class _Group:
 
     @one_thread()
     @array_function
-    def _alone(self, lanes: Sequence[AbstractLane], inexact: bool = True) -> list[_Start]:
+    def _alone(self, lanes: Sequence[AbstractLane], inexact: bool) -> list[_Start]:
         every, of, parts = cast("Sequence[Harmonics]", lanes), source_of(self.known).errors, []
         of_all = self.known, self.circuit, self.prior, inexact
         for found, changed in estimates(every, *of_all):

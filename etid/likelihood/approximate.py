@@ -16,11 +16,10 @@ from jaxtyping import Bool, Complex, Float
 
 from etid.likelihood import scores
 from etid.likelihood.discrepancy import POWERS, Discrepancy, kernels, splines
-from etid.likelihood.restricted import Restricted, restricted
+from etid.likelihood.restricted import ROUNDS, Restricted, restricted
 from etid.likelihood.search import Load, Minimum, Near, minimum, of_load, select
 
 ORDINARY = 2 * POWERS.size + 1  # number of the kernel to begin with
-ROUNDS = 2  # the size of δ is chosen again where its first choice has led
 FAR = 5e-3  # of the signal; the minimum of a circuit that leaves more may lie far away
 # Likelihood ratio, from which on a change explains what a circuit leaves: of 200 smooth functions
 # that have no name, the largest of all changes had 10.

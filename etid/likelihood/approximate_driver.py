@@ -19,13 +19,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.likelihood import driver
+from etid.likelihood import discrepancy, driver
 from etid.likelihood.calibrations import Calibrations, Near
 from etid.likelihood.discrepancy import root_of, splines
 from etid.likelihood.linear import LevenbergMarquardt
 from etid.likelihood.noise import is_smooth
 from etid.likelihood.of_calibrations import likeliest_section
-from etid.likelihood.restricted import Restricted, restricted
+from etid.likelihood.restricted import ROUNDS, Restricted, restricted
 from etid.likelihood.source_prior import same_load
 from etid.results.driver import LARGEST
 from etid.signals.departure import Departure
@@ -34,7 +34,6 @@ from etid.signals.departure import Departure
 PERHAPS = 0.78
 # Likelihood ratio of δ. Of 60 good drivers at 40 to 80 dB the largest is 8.
 SURE = 25.0
-ROUNDS = 2  # the size of δ is chosen again where its first choice has led
 STEPS = 60  # with one more section; what it explains is seen earlier
 SMALLEST = 1e-3  # size of a function relative to the largest, below which it makes no difference
 
@@ -128,8 +127,7 @@ def nearest(
     c, rest = np.zeros(delta.coefficients.size), q[modes:]
     if other is not None:
         own, rest = np.split(rest, [other.coefficients.size])
-        at = own.reshape(2, -1) @ other.functions.T
-        c = (at @ delta.functions / (delta.functions**2).sum(0)).reshape(-1)
+        c = discrepancy.nearest(delta.functions, own.reshape(2, 1, -1) @ other.functions.T)
     return np.concatenate([q[:modes], c, rest])
 
 

@@ -73,6 +73,15 @@ def root_of(covariance: Float[np.ndarray, "*row node node"]) -> AnyArray:
     return functions * np.sqrt(np.maximum(sizes, 0.0))[..., None, :]
 
 
+def nearest(
+    root: Float[np.ndarray, "*row node function"], nodes: Float[np.ndarray, "*row 2 output node"]
+) -> Float[np.ndarray, "*row c"]:
+    """Coefficients of the δ that is nearest to these values: the functions are orthogonal."""
+    size = (root**2).sum(-2)[..., None, None, :]
+    c = nodes @ root[..., None, :, :] / np.where(size > 0, size, 1.0)
+    return c.reshape(*c.shape[:-3], -1)
+
+
 class Discrepancy(NamedTuple):
     """δ of the outputs of loads as a function of its coefficients, whose prior is N(0, 1).
 
@@ -101,10 +110,8 @@ class Discrepancy(NamedTuple):
         return parts @ self.root.swapaxes(-1, -2)[..., None, :, :]
 
     def nearest(self, nodes: Float[np.ndarray, "*row 2 output node"]) -> np.ndarray:
-        """The coefficients of the nearest δ: the functions are orthogonal."""
-        size = (self.root**2).sum(-2)[..., None, None, :]
-        c = nodes @ self.root[..., None, :, :] / np.where(size > 0, size, 1.0)
-        return c.reshape(*c.shape[:-3], -1)
+        """The coefficients of the nearest δ."""
+        return nearest(self.root, nodes)
 
     def rows(self, rows: np.ndarray) -> "Discrepancy":
         """Those of some of the loads."""

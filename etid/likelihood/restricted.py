@@ -32,6 +32,7 @@ from etid.likelihood.discrepancy import kernels, roots
 from etid.likelihood.linear import diagonal
 
 LEVELS = np.geomspace(0.1, 10.0, 15)  # sizes of δ, relative to what the circuit leaves
+ROUNDS = 2  # in a fit, the size of δ is chosen again where its first choice has led
 SMALLEST = 1e-9  # of a matrix that is scaled to a unit diagonal
 NOTHING = 1e-6  # of the information about a change; the parameters leave less of what they can make
 
