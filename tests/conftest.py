@@ -1,10 +1,13 @@
 """Session-wide settings: float64, no silent promotion, seeded keys, reference data or a skip."""
 
+import functools
+import inspect
 import os
 import pathlib
 import signal
 
 import jax
+import jaxtyping
 import pytest
 from hypothesis import settings
 
@@ -25,6 +28,41 @@ if jax.__version_info__ < (0, 12):  # later ones do not know it
     COMPILE_FAST = f"--xla_cpu_use_fusion_emitters=false {COMPILE_FAST}"
 
 REFERENCE_DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
+
+
+CHECKED = set()  # functions whose annotations the present test has checked
+_checks_each_call = jaxtyping._decorator.jaxtyped
+
+
+def _checks_first_call(of, *, typechecker):
+    """The decorator of functions, and of those in classes; to check each call costs much more.
+
+    A function in a function is another one at each call, whose check would be compiled anew.
+    """
+    if not inspect.isfunction(of):  # its functions come here, too
+        return _checks_each_call(of, typechecker=typechecker)
+    if "<locals>" in of.__qualname__:
+        return of
+    checked = functools.cache(lambda: _checks_each_call(of, typechecker=typechecker))
+
+    @functools.wraps(of)
+    def call(*args, **kwargs):
+        __tracebackhide__ = True
+        if call in CHECKED:
+            return of(*args, **kwargs)
+        CHECKED.add(call)
+        return checked()(*args, **kwargs)
+
+    return call
+
+
+jaxtyping._decorator.jaxtyped = _checks_first_call
+jaxtyping.jaxtyped = functools.partial(functools.partial, _checks_first_call)
+
+
+def pytest_runtest_setup():
+    """Check annotations anew."""
+    CHECKED.clear()
 
 
 def pytest_configure(config):

@@ -219,8 +219,8 @@ def test_hazards_of_the_loop_end_with_0_and_faults_of_the_loop_are_counted(monke
     assert with_fault(Stimulator, "_give_zero", only_at_rest, "STOP")[0] == 1
     never = with_fault(Stimulator, "_watch", lambda _: None, "silence")
     assert never[3] > 2 * PAUSE * control_loop.PERIOD
-    # In one of these runs the skin becomes wet.
-    assert with_fault(etid.Tracker, "start", as_before, "counter from 0", draws=3)[2] > 0
+    # In half of the runs the skin becomes wet; not each of them gives a pulse then.
+    assert with_fault(etid.Tracker, "start", as_before, "counter from 0", draws=8)[2] > 0
 
 
 @pytest.mark.slow

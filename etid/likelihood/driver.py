@@ -35,6 +35,8 @@ from etid.signals.transfer import AnyArray, as_complex, power
 ROUGHLY = 0.2  # [standard errors] length of the last steps with bands
 ROUGH_STEPS = 60  # with bands; with half of them a driver takes twice as long, with more as long
 PATIENCE = 3  # short steps that end a search: a step after a rejected one is short, too
+SURE = 2  # points of a start after which its approximation says where it ends
+BEHIND = 1.0  # of ½ Σ r² above the deepest point, where a start may end no more
 MAX_STEPS = 500  # at the knots of one point
 
 
@@ -186,6 +188,12 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
         of = ahead(*best, better, state.ahead), state.trial, better, reduced, state.idle
         return select(state.moves, decision(*best, *of, state.points), state)
 
+    def in_front(state: _State) -> _State:
+        """The same without the starts whose approximations end above the deepest point."""
+        ends = state.objective - state.ahead.promised
+        behind = (state.points > SURE) & (ends > state.objective.min() + BEHIND)
+        return state._replace(moves=state.moves & ~behind)
+
     def decision(
         near: Near,
         objective: AnyArray,
@@ -206,7 +214,8 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
     none = xp.zeros(objective.shape, int)
     found = followed(near, objective / model.terms)
     of = start, xp.isfinite(objective), xp.zeros_like(objective), none, none
-    last = repeated(step, decision(near, objective, found, *of), POINTS - 1)
+    going = step if start.ndim == 1 else lambda state: in_front(step(state))
+    last = repeated(going, decision(near, objective, found, *of), POINTS - 1)
     q = xp.where(last.settled[..., None], last.target, last.near.q)
     return Minimum(q, last.objective, last.ahead.matrix, last.settled, last.points)
 

@@ -49,6 +49,7 @@ IDLE = 3  # points in a row with a reduction below the rounding errors of ½ Σ 
 ROUNDING = 1e-6  # of ½ Σ r²
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
 WRONG = 1.5  # χ² of a minimum with states, from which on other starts are tried; wrong ones had 2.7
+SAME = 1.0  # largest difference of ½ Σ r² between two searches that have found one minimum
 STEPS = 50  # largest number of steps at the knots of one point
 FARTHEST = 3.0  # scale of a step in the logarithm of an element, and in a delay [samples]
 DISTANT = 0.1  # part of ½ Σ r² that a step promises, above which a point is distant
@@ -92,6 +93,11 @@ class Load:
         transient = self.transient and self.transient.of(rows)
         of = {"gains": gains, "records": records, "unloaded": unloaded, "transient": transient}
         return dataclasses.replace(self, **of)
+
+    @property
+    def has_current(self) -> bool:
+        """Whether the current through the load was measured."""
+        return self.gains.source.loaded is None or self.gains.outputs.count > 1
 
     def known(self, q: Float[AnyArray, "*row q"]) -> Records:
         """The records with the X that the calibrations estimate."""
@@ -379,16 +385,22 @@ def _searched_again(
     """The minima, some of them from other starts, in NumPy.
 
     A record that begins in a pulse does not show how its likeliest start is wrong by its states.
+    Two starts that lead to the same minimum are enough.
     """
+
+    def fits(least: Minimum, terms: Float[np.ndarray, " row"]) -> Bool[np.ndarray, " row"]:
+        return 2 * least.near.objective < WRONG * terms
+
+    wrong = ~fits(least, load.records.terms)
     for start in starts[1:]:
-        wrong = ~(2 * least.near.objective < WRONG * load.records.terms)
         if not wrong.any():
             break
         rows = np.flatnonzero(wrong)
-        other = _search(load.of(rows), start[None, rows], aside)
-        deeper = other.near.objective < least.near.objective[rows]
-        if deeper.any():
-            least = replaced(least, rows[deeper], taken(other, deeper))
+        other, best = _search(load.of(rows), start[None, rows], aside), taken(least, rows)
+        reduced = best.near.objective - other.near.objective
+        best = select(reduced > 0, other, best)
+        least = replaced(least, rows, best)
+        wrong[rows] = ~(fits(best, load.records.terms[rows]) | (abs(reduced) <= SAME))
     return least
 
 
@@ -422,6 +434,8 @@ def _search(
     most = POINTS if load.gains.discrepancy is None else FEWER
     place = np.arange(starts.shape[-1])
     delays = (place >= load.gains.delays.start) & (place < load.gains.delays.stop)
+    if load.has_current and load.transient is None:  # all harmonics have told its starts apart
+        starts = starts[:1]
 
     def step(load: Load, at_knots: Gains, state: _State) -> _State:
         near = Near.of(load, at_knots, state.trial)

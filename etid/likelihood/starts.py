@@ -36,7 +36,6 @@ from etid.circuits.circuit import AbstractCircuit, SkinRC, impedance_at
 from etid.likelihood.gains import VoltageAndCurrent
 from etid.likelihood.search import Load
 from etid.precision import array_function, held, in_turn, namespace
-from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex, power
 
 RATE = 3e4  # [rad/s] rate of a skin's relaxation; in this unit the coefficients are near 1
@@ -44,6 +43,7 @@ STEPS = 5  # iterations of Steiglitz-McBride; more of them spare a fit no steps
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels of the other starts
 # Time constants of the starts with a measured current, relative to the typical ones.
 TIME_SCALES = np.geomspace(1e-3, 1e5, 17)
+ROUGH = 0.01  # relative error of Y/I below which one line says as much as another
 
 
 @array_function
@@ -101,31 +101,51 @@ def _by_harmonics(load: Load) -> Float[AnyArray, "start *row own"]:
 def _by_current(
     load: Load, current: Complex[AnyArray, "*row bin"], variance: Float[AnyArray, "*row bin"]
 ) -> Float[AnyArray, "start *row own"]:
-    """Starts of the own parameters from a measured current, one for each time scale.
+    """Starts of the own parameters from a measured current, one for each time scale, best first.
 
-    The records show |Z| = |Y/I|, so the impedance level of each start is known. The means are over
-    ln f, because the lines of a spectrum are denser at high frequencies.
+    The records show Y/I, so the impedance level of each start is known, the delay if the record is
+    of whole periods, and which start comes nearest. The means are over ln f, because the lines of
+    a spectrum are denser at high frequencies.
     """
-    xp, records, circuit = namespace(current), load.records, load.gains.circuit
-    used = records.used[..., 0, :]
-    y = xp.where(used, records.y[..., 0, :], 0.0)
-    current = xp.where(used, current, 0.0)
-    shown = signal_share(current, variance) * signal_share(y, records.variance_y[..., 0, :])
-    sizes = power(y), power(current)
-    weight = (sizes[0] > 0) & (sizes[1] > 0)
-    weight = xp.where(weight, shown, 0.0) / load.gains.frequency
-    ratio = xp.where(weight > 0, sizes[0] / xp.where(weight > 0, sizes[1], 1.0), 1.0)
-    size = 0.5 * xp.log(ratio)
+    xp, circuit, every = namespace(current), load.gains.circuit, load.knots
+    weight, size, turned = _ratio(load, current, variance)
+    f = every.at(load.gains.frequency)
     typical, (by_size, by_time) = _typical(circuit), circuit.scaling()
     own = (len(TIME_SCALES), *size.shape[:-1])
     logs = xp.zeros((*own, 1)) + typical
     logs = logs + xp.asarray(np.log(TIME_SCALES)).reshape(-1, *[1] * size.ndim) * by_time
-    every = load.knots  # Z is smooth, the weights are not
-    z = impedance_at(circuit, logs, every.at(load.gains.frequency))
-    off = (weight * size).sum(-1) - 0.5 * (every.summed(weight) * xp.log(power(z))).sum(-1)
-    level = (off / weight.sum(-1))[..., None] * by_size
-    rest = xp.zeros((*own, load.gains.exact - load.gains.elements))
-    return xp.concatenate([logs + level, rest], -1)[::-1]
+    z = impedance_at(circuit, logs, f)
+    size, phase = size - 0.5 * xp.log(power(z)), xp.angle(turned * xp.conj(z))
+    level = (weight * size).sum(-1, keepdims=True) / weight.sum(-1, keepdims=True)
+    omega = 2 * np.pi * f
+    late = -(weight * omega * phase).sum(-1, keepdims=True)
+    late = late / (weight * omega**2).sum(-1, keepdims=True)
+    if load.transient is not None:  # states turn phases, too
+        late = 0.0 * late
+    off = (weight * ((size - level) ** 2 + (phase + omega * late) ** 2)).sum(-1)
+    delays = xp.zeros((*own, load.gains.exact - load.gains.elements - 1))
+    found = [logs + level * by_size, late * load.gains.sample_rate, delays]
+    order = xp.argsort(off, axis=0)[..., None]
+    return xp.take_along_axis(xp.concatenate(found, -1), order, 0)
+
+
+def _ratio(
+    load: Load, current: Complex[AnyArray, "*row bin"], variance: Float[AnyArray, "*row bin"]
+) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Weights of the knots, and there the mean ln|Y/I|, and a mean of the same phase as Y/I."""
+    xp, records, every = namespace(current), load.records, load.knots
+    y, variance_y = records.y[..., 0, :], records.variance_y[..., 0, :]
+    sizes = power(y), power(current)
+    seen = records.used[..., 0, :] & (sizes[0] > 0) & (sizes[1] > 0)
+    sizes = [xp.where(seen, each, 1.0) for each in sizes]
+    noise = variance_y / sizes[0] + variance / sizes[1]
+    weight = xp.where(seen, 1 / (noise + ROUGH**2), 0.0) / load.gains.frequency
+    turned = as_complex(weight / xp.sqrt(sizes[0] * sizes[1])) * y * xp.conj(current)
+    turned = xp.where(seen, turned, 0.0)
+    log = 0.5 * xp.log(sizes[0] / sizes[1])
+    # Z is smooth, the weights are not.
+    sums = every.summed(xp.stack([weight, weight * log, turned.real, turned.imag]))
+    return sums[0], sums[1] / xp.where(sums[0] > 0, sums[0], 1.0), sums[2] + 1j * sums[3]
 
 
 def _steiglitz_mcbride(load: Load) -> Float[AnyArray, "*row coefficient"]:
