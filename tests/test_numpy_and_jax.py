@@ -32,9 +32,10 @@ def test_numpy_and_jax_have_the_same_verdicts_and_elements(number, snr_db, monke
     for name in DISTURBED:
         disturbed = perturbation_list.change_of(name)(base).recordings()
         records += [disturbed["dry"], disturbed["damp"]]
-    found = etid.identify_skins(records, driver)
+    # Only NumPy takes what a circuit leaves into the fit.
+    found = etid.identify_skins(records, driver, accept=0.0)
     monkeypatch.setattr(fitting, "ROWS", False)
-    expected = etid.identify_skins(records, driver)
+    expected = etid.identify_skins(records, driver, accept=0.0)
     np.testing.assert_array_equal(found.verdicts, expected.verdicts)
     np.testing.assert_array_equal(found.fit.remarks, expected.fit.remarks)
     values, others = (np.asarray(of.circuit.values()) for of in (found, expected))

@@ -112,7 +112,7 @@ def test_a_fit_predicts_its_record_down_to_the_noise(study, driver):
 def test_a_constant_phase_is_identified_and_predicted_in_less_than_a_period(driver):
     short = scene(samples=3_000).simulate(3)["spread"]
     fit = etid.identify_skin(short, driver, circuit=etid.SkinCole())
-    assert fit.method == "output_error"
+    assert fit.method == "maximum_likelihood"
     off = np.asarray(fit.circuit.values() - SPREAD.values())
     assert (np.abs(off) < SIGMAS * np.asarray(fit.stderr.values())).all()
     noise = 10 ** (-60 / 20) * np.std(short.v_th)

@@ -112,6 +112,7 @@ def _fit(
 ) -> Hum | None:
     """Hum by least squares; None if the sinusoids explain too little of the bins.
 
+    Two periods have 32 numbers for 19 parameters, which also fit pulses that the ends cut.
     χ² must fall by 80, which noise and 15 parameters exceed once in 10⁹. `_pulses` may fail to
     describe 5 % of the leakage of pulses. Sinusoids may leave a tenth of the excess over noise.
     """
@@ -123,6 +124,8 @@ def _fit(
     others = np.concatenate([np.real(others), np.imag(others)])
     others /= np.sqrt(np.sum(others**2, axis=0, keepdims=True))
     measured = np.concatenate([np.real(transform[bins]), np.imag(transform[bins])])
+    if measured.size < 2 * (2 * MULTIPLES + others.shape[1]):
+        return None
     drifting, before = _rest(others[:, :DRIFT_DEGREE], measured), _rest(others, measured)
     significant = 80.0
     if before - measured.size < max(significant, 0.05 * (drifting - before)):
