@@ -4,6 +4,7 @@ from typing import Any
 
 import h5py
 import hypothesis.extra.numpy as hnp
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -105,6 +106,7 @@ def test_rows_of_a_stack_are_recordings_with_their_own_label_and_a_common_v_th(p
 
 
 def test_samples_are_not_read_before_they_are_asked_for(path, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # it looks at an item
     with hdf5.read(path) as study:
         monkeypatch.setattr(h5py.Dataset, "__getitem__", None)
         assert list(study.where(subject="s01", trial="only")) == ["s01/damp"]
