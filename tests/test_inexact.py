@@ -178,7 +178,7 @@ def test_errors_of_a_single_period_contain_it():
         for one in of.loaded.recordings():
             found = etid.identify_skin(one, driver, throw=False)
             verdicts.append(found.verdict)
-            if found.verdict == "approximate":
+            if found.usable:  # hum and wander of so short a record explain some of it
                 off = np.asarray(found.circuit.values()) - study.truths[str(one.path)].low
                 z.append(off / np.asarray(found.stderr.values()))
     assert len(z) >= 5  # others look like a fault that has a name

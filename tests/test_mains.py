@@ -4,6 +4,10 @@ import numpy as np
 import pytest
 
 import etid
+from benchmarks import perturbed_study
+from benchmarks.laboratory import hum
+from benchmarks.ladder import LOADS
+from benchmarks.perturbed_study import all_records, both
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Samples
 from etid.recordings.remarks import Remark
@@ -11,6 +15,7 @@ from etid.signals import mains, quick_looks
 from etid.simulation import scenes
 from etid.simulation.scenes import Scene
 from tests import kept_numbers
+from tests.skins import off
 
 SCALE = Scene().scale
 DRY = scenes.paper_dry()
@@ -162,3 +167,18 @@ def test_a_joint_fit_leaves_hum_out():
         error = np.asarray(getattr(found.fits.stderr, name))
         assert (np.abs(off) < 4 * error).all()  # nine numbers exceed it once in 1 800 draws
         assert (error < 0.01 * getattr(DRY.trials[0].load, name)).all()
+
+
+@pytest.mark.parametrize("samples", [3334, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("added", [hum(50.0, 0.05), hum(60.0, 0.1), hum(1.0, 0.5)])
+def test_hum_and_wander_are_among_the_states_of_a_record_that_is_not_whole_periods(added, samples):
+    """In all records; without such states the driver takes them, or the search does not end."""
+    for number in range(2):
+        study = perturbed_study.lasting(samples)(perturbed_study.undisturbed(number, 60.0))
+        disturbed = all_records(both(added=(added,)))(study).recordings()
+        driver = etid.identify_driver(list(disturbed.calibrations.recordings()))
+        for path, load in LOADS.items():
+            fit = etid.identify_skin(disturbed[path], driver)
+            assert fit.verdict == "successful"
+            # 36 normal numbers for each length: one in 400 such tests.
+            assert (np.abs(off(fit, load)) < 4).all()

@@ -26,7 +26,14 @@ from etid.likelihood.sandwich import Linear
 from etid.likelihood.shared import Calibrated
 from etid.likelihood.source import Source, Tolerances
 from etid.likelihood.source_prior import DELAY_WIDTH, SourcePrior, delay_width
-from etid.likelihood.transient import ENDS, ends, states_of_calibrations, width_of
+from etid.likelihood.transient import (
+    DISTURBANCES,
+    ENDS,
+    disturbances,
+    ends,
+    states_of_calibrations,
+    width_of,
+)
 from etid.precision import array_function, namespace
 from etid.results.driver import Calibration, HarmonicDriver
 from etid.results.feed import SourceImpedance
@@ -224,24 +231,26 @@ class Calibrations:
         if s.whole:
             return None
         rate, first = self.rate, s.frequency[0, 0]
-        of_ends = ends(s.x.shape[-1]) * (first / rate)
-        decays = modal.decays(self.parameters(common), self._sections, s.frequency[0])
-        width = width_of(s.y, s.selected)
-        return states_of_calibrations(gains, decays * first, of_ends, width)
+        xp, added = namespace(common), disturbances(s.x.shape[-1], first)
+        of_ends = xp.concatenate([ends(s.x.shape[-1]) * (first / rate), added])
+        decays = first * modal.decays(self.parameters(common), self._sections, s.frequency[0])
+        decays = xp.concatenate([decays, added + xp.zeros((*decays.shape[:-2], 1, 1))], -2)
+        return states_of_calibrations(gains, decays, of_ends, width_of(s.y, s.selected))
 
     @property
     def unknown_states(self) -> int:
         """Number of states of the records."""
         count, poles = self.calibration.r_load.shape[0], self.source.order
-        return 0 if self.spectra.whole else count * (poles + ENDS)
+        return 0 if self.spectra.whole else count * (poles + ENDS + 2 * DISTURBANCES)
 
     def _states_by_q(
         self, common: Float[AnyArray, "*row common"], profiles: list[Profile], slopes: Slopes
     ) -> Complex[AnyArray, "*row common record knot"]:
         """∂/∂c of what the states make, at the same X − V."""
         xp, count = namespace(common), self.calibration.r_load.shape[0]
-        p = added([of.states for of in profiles])[..., : count * self.source.order]
-        p = p.reshape(*p.shape[:-1], count, -1)
+        p = added([of.states for of in profiles])
+        each = self.source.order + DISTURBANCES  # the others are those of the outputs
+        p = p[..., : count * each].reshape(*p.shape[:-1], count, each)[..., : self.source.order]
         f, first = self._frequency(self.knots)[0], self.spectra.frequency[0, 0]
         moved = modal.decays_by_parameters(self.parameters(common), self._sections, p * first, f)
         by_source = -xp.moveaxis(moved, -2, -3) * slopes.gains[..., None, :, :]

@@ -25,6 +25,10 @@ effects on the record cancel.
 **An error of the gain** (`etid.likelihood.discrepancy`) multiplies all of V_out by e^δ, Ψ too. What
 δ does to the state of its own channel at the ends of a record is of second order, or at rest there.
 
+**Hum and wander.** Sinusoids at the mains' frequencies and a parabola in time, which one of the
+instruments adds to its record, are states whose decays do not depend on the circuit. In the record
+of the input they are among φ, in others beside them.
+
 **Ends.** The samples beside the ends have no neighbours on one side, so that aliases of the cut are
 in the record. They are smooth in frequency: polynomials of s stand for them. The offset of a record
 is its mean, so that bin 0 tells nothing.
@@ -49,6 +53,9 @@ from etid.signals.transfer import AnyArray, as_complex, frequency_variable, powe
 
 ENDS = 4  # polynomials; with 2 to 12 of them estimates and errors are the same
 LARGEST = 10.0
+MAINS = 50.0, 150.0, 60.0, 180.0  # [Hz]
+SHORTEST = 0.75  # [periods of the lower mains frequency] record in which they are seen
+DISTURBANCES = 2 * len(MAINS) + 2  # numbers of hum and wander in a record
 PER_DECADE = 2  # relaxations of a load that is no ratio of polynomials
 
 
@@ -66,6 +73,29 @@ def ends(bins: int) -> Complex[np.ndarray, "end bin"]:
     """What the ends of a record add to an output, at its first bins without bin 0."""
     place = np.arange(1.0, bins + 1) / bins
     return np.stack([(1j * place) ** power for power in range(ENDS)])
+
+
+def disturbances(
+    bins: int, first: Float[AnyArray, ""] | float
+) -> Complex[AnyArray, "disturbance bin"]:
+    """What hum and wander add to a record, at its first bins without bin 0; the first is [Hz].
+
+    With a size of 1 they are as large as the widest prior of a state allows. In a shorter record
+    than `SHORTEST` they look like the decays of its circuit, and are 0.
+    """
+    xp, k = namespace(first), np.arange(1.0, bins + 1)
+    place = xp.asarray(np.array(MAINS) / first)[:, None]
+    ahead, back = (
+        as_complex(xp.sinc(of - k)) * _turned(np.pi * (of - k)) for of in (place, -place)
+    )
+    waves = xp.stack([ahead + back, 1j * (ahead - back)])
+    found = xp.concatenate([waves.reshape(-1, bins), np.stack([1j / k, 1 / k**2])])
+    return xp.where(place[0] > SHORTEST, found / LARGEST, 0.0)
+
+
+def _turned(angle: Float[AnyArray, "*row bin"]) -> Complex[AnyArray, "*row bin"]:
+    xp = namespace(angle)
+    return xp.cos(angle) + 1j * xp.sin(angle)
 
 
 def _channels(of: AnyArray, axis: int = -2) -> list[AnyArray]:
@@ -130,6 +160,16 @@ class Transient:
             ends=xp.concatenate([rest, more], -2),
             passed=(of_v_out * of_current)[..., 0, :],
         )
+
+    def disturbed(self, first: Float[AnyArray, ""] | float) -> "Transient":
+        """The same of records with hum and wander, whose first bin is at this frequency [Hz]."""
+        xp, added = namespace(self.decays, first), disturbances(self.ends.shape[-1], first)
+
+        def beside(of: AnyArray) -> AnyArray:
+            more = added + xp.zeros((*of.shape[:-2], 1, 1))
+            return xp.concatenate([of, more], -2)
+
+        return dataclasses.replace(self, decays=beside(self.decays), ends=beside(self.ends))
 
     def of(self, rows: np.ndarray) -> "Transient":
         """Those of some of the rows."""

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Complex, Float
 
 from etid.likelihood.noise import excess
 from etid.likelihood.profile import Records
+from etid.likelihood.transient import disturbances
 from etid.precision import array_function, namespace
 from etid.results.driver import HarmonicDriver
 from etid.signals.harmonics import Spectrum, signal_share
@@ -48,7 +49,8 @@ class UnloadedShape(NamedTuple):
         x: Fourier coefficients [V]; 0 where they are not used.
         variance: E|noise|² of each coefficient [V²].
         directions: Orthonormal directions in which δ changes `x`, orthogonal to amplitude and
-            delay; first the real parts, then the imaginary parts.
+            delay, and to hum and wander of records that are not whole periods; first the real
+            parts, then the imaginary parts.
         bias: Bias along each direction [V]. It arises because the directions contain the noise of
             `x` too.
         drift: Difference that the drift of the driver makes, relative to V_th.
@@ -73,9 +75,13 @@ def shape(spectrum: Spectrum, drift: Float[AnyArray, ""] | None = None) -> Unloa
     smooth = xp.stack([xp.cos(n * xp.arccos(xp.clip(u, -1, 1))) for n in range(DEGREE)])
     by_delta = smooth * x
     by_delay = 1j * x * f / f[-1]
-    rows = xp.concatenate([x[None], by_delay[None], by_delta[1:], by_delta * 1j])
+    free = [x[None], by_delay[None]]
+    if not spectrum.whole:
+        free.append(xp.where(used, disturbances(size, f[0]), 0.0))
+    free = xp.concatenate(free)
+    rows = xp.concatenate([free, by_delta[1:], by_delta * 1j])
     real = xp.concatenate([rows.real, rows.imag], axis=1)
-    directions = xp.linalg.qr(real.T)[0].T[2:]
+    directions = xp.linalg.qr(real.T)[0].T[free.shape[0] :]
     # Σ Re (q/x)* σ²: a direction q is x times a function of frequency; the difference contains −x.
     share = xp.where(used, spectrum.variance_x / xp.where(used, power(x), 1.0), 0.0)
     bias = directions @ (xp.concatenate([x.real, x.imag]) * xp.tile(share, 2))

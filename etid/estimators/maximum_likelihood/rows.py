@@ -93,6 +93,8 @@ def load_of(
     if filters is not None:
         of_x = width_of(lane.x[..., None, :], used)[..., 0]
         transient = transient.filtered(filters, lane.frequency, of_x)
+    if source.loaded is not None:  # one instrument records a current and its voltage, in volts
+        transient = transient.disturbed(first)
     return dataclasses.replace(load, transient=transient)
 
 

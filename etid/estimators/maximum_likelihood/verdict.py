@@ -60,6 +60,12 @@ def judged(
     outer = values[..., :, None] * values[..., None, :]
     cov, shared_cov = found.cov * outer, found.shared_cov * outer
     none = xp.zeros(values.shape[:-1], bool)
+    rest = left(found.chi2, found.rrse)
+    # A circuit that leaves more than is accepted competes with others without its δ.
+    deviance = xp.where(
+        found.approximate & (rest > accept), found.chi2 * support.terms, support.deviance
+    )
+    support = dataclasses.replace(support, deviance=xp.asarray(deviance))
     outside, contradicted = None, none
     if own:
         numbers = within(circuit, values, cov, shared_cov, own)
@@ -71,7 +77,6 @@ def judged(
         values = xp.where(sound, inside, values)
     values = xp.where(width <= FIXED, told, values)
     late = (xp.abs(found.delays) > 1).any(-1)  # the model holds for delays of up to one sample
-    rest = left(found.chi2, found.rrse)
     missed = xp.where(found.approximate, rest > accept, misses(found.chi2, found.rrse))
     reasons = (
         (~xp.isfinite(found.chi2), "unstable"),
