@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from etid.likelihood.gains import FAULTS, Slopes
 from etid.likelihood.noise import excess
@@ -29,6 +29,7 @@ from etid.likelihood.source_prior import DELAY_WIDTH, SourcePrior, delay_width
 from etid.likelihood.transient import (
     DISTURBANCES,
     ENDS,
+    are_seen,
     disturbances,
     ends,
     states_of_calibrations,
@@ -238,10 +239,11 @@ class Calibrations:
         return states_of_calibrations(gains, decays, of_ends, width_of(s.y, s.selected))
 
     @property
-    def unknown_states(self) -> int:
+    def unknown_states(self) -> Int[AnyArray, ""]:
         """Number of states of the records."""
-        count, poles = self.calibration.r_load.shape[0], self.source.order
-        return 0 if self.spectra.whole else count * (poles + ENDS + 2 * DISTURBANCES)
+        first, count = self.spectra.frequency[0, 0], self.calibration.r_load.shape[0]
+        added = namespace(first).where(are_seen(first), 2 * DISTURBANCES, 0)
+        return added * 0 if self.spectra.whole else count * (self.source.order + ENDS + added)
 
     def _states_by_q(
         self, common: Float[AnyArray, "*row common"], profiles: list[Profile], slopes: Slopes

@@ -208,7 +208,8 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
             each[name] = scores.rough(linear, added, near, every, share, noise, e)
 
     squares, terms = 2 * profile.objective, records.terms
-    states = 0 if profile.states is None else profile.states.shape[-1]
+    # Hum that a record is too short for is exactly 0.
+    states = 0 if profile.states is None else (profile.states != 0).sum(-1)
     seen, relevant = scores.seen(each), scores.relevant(each)
     over = squares - terms + states - UNSURE * xp.sqrt(2 * terms)
     causes = (fall.z >= xp.abs(relevant).max(-1)) & (fall.explained > SHARE * over)

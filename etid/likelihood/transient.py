@@ -90,7 +90,12 @@ def disturbances(
     )
     waves = xp.stack([ahead + back, 1j * (ahead - back)])
     found = xp.concatenate([waves.reshape(-1, bins), np.stack([1j / k, 1 / k**2])])
-    return xp.where(place[0] > SHORTEST, found / LARGEST, 0.0)
+    return xp.where(are_seen(first), found / LARGEST, 0.0)
+
+
+def are_seen(first: Float[AnyArray, ""] | float) -> Bool[AnyArray, ""]:
+    """Whether hum and wander are told from decays in records whose first bin is there [Hz]."""
+    return namespace(first).asarray(first < MAINS[0] / SHORTEST)
 
 
 def _turned(angle: Float[AnyArray, "*row bin"]) -> Complex[AnyArray, "*row bin"]:
