@@ -66,7 +66,7 @@ def assert_equal(written, read):
 # Method of the driver, and how many of a thousand fits. Nonsense takes all steps that a fit may:
 # 45 ms on the harmonics, where a skin takes one, and half a second in time.
 METHODS = {
-    "maximum_likelihood": ("maximum_likelihood", 150),
+    "maximum_likelihood": ("maximum_likelihood", 80),
     "steiglitz_mcbride": ("steiglitz_mcbride", 100),
     "equation_error": ("steiglitz_mcbride", 300),
     "output_error": ("output_error", 10),
