@@ -165,8 +165,7 @@ def test_it_is_a_spline_between_its_nodes_and_constant_beyond():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("resistors", [2, 4])
-@pytest.mark.parametrize("length", [0.5, 2.0])
+@pytest.mark.parametrize(("length", "resistors"), [(0.5, 2), (2.0, 4)])
 def test_errors_contain_it(length, resistors):
     z = np.concatenate(
         [

@@ -234,7 +234,7 @@ def test_a_gain_in_all_records_that_no_test_proves_is_in_the_errors(snr_db, gain
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("snr_db", [30.0, 40.0, 50.0, 60.0])
+@pytest.mark.parametrize("snr_db", [30.0, 60.0])
 def test_good_recordings_are_refused_as_rarely_as_a_study_can_bear(snr_db):
     """Of 2000 with drawn drivers; seven tests of 1 in 10 000 refuse 1.4 of them.
 
