@@ -57,6 +57,7 @@ def _checks_first_call(of, *, typechecker):
 
 
 jaxtyping._decorator.jaxtyped = _checks_first_call
+# A module that is checked asks for a decorator: `@jaxtyped(typechecker=…)`.
 jaxtyping.jaxtyped = functools.partial(functools.partial, _checks_first_call)
 
 

@@ -63,7 +63,7 @@ def assert_equal(written, read):
         np.testing.assert_array_equal(column, theirs[name], err_msg=name)
 
 
-# Method of the driver, and how many of a thousand fits. Nonsense takes all steps that a fit may:
+# Method of the driver, and how many fits. Nonsense takes all steps that a fit may:
 # 45 ms on the harmonics, where a skin takes one, and half a second in time.
 METHODS = {
     "maximum_likelihood": ("maximum_likelihood", 80),

@@ -30,7 +30,7 @@ from etid.likelihood.transient import (
     DISTURBANCES,
     ENDS,
     are_seen,
-    disturbances,
+    disturbed,
     ends,
     states_of_calibrations,
     width_of,
@@ -232,18 +232,19 @@ class Calibrations:
         if s.whole:
             return None
         rate, first = self.rate, s.frequency[0, 0]
-        xp, added = namespace(common), disturbances(s.x.shape[-1], first)
-        of_ends = xp.concatenate([ends(s.x.shape[-1]) * (first / rate), added])
-        decays = first * modal.decays(self.parameters(common), self._sections, s.frequency[0])
-        decays = xp.concatenate([decays, added + xp.zeros((*decays.shape[:-2], 1, 1))], -2)
+        of_ends = disturbed(ends(s.x.shape[-1]) * (first / rate), first)
+        decays = modal.decays(self.parameters(common), self._sections, s.frequency[0])
+        decays = disturbed(decays * first, first)
         return states_of_calibrations(gains, decays, of_ends, width_of(s.y, s.selected))
 
     @property
-    def unknown_states(self) -> Int[AnyArray, ""]:
+    def unknown_states(self) -> Int[AnyArray, ""] | int:
         """Number of states of the records."""
+        if self.spectra.whole:
+            return 0
         first, count = self.spectra.frequency[0, 0], self.calibration.r_load.shape[0]
         added = namespace(first).where(are_seen(first), 2 * DISTURBANCES, 0)
-        return added * 0 if self.spectra.whole else count * (self.source.order + ENDS + added)
+        return count * (self.source.order + ENDS + added)
 
     def _states_by_q(
         self, common: Float[AnyArray, "*row common"], profiles: list[Profile], slopes: Slopes

@@ -3,8 +3,9 @@
 Some steps with bands of harmonics (`etid.signals.knots`) bring the starts near their minima. From a
 distant start, the derivatives of the terms themselves, which contain their noise, find deeper
 minima than those with X̂. Then each goes to its minimum with all harmonics, by successive
-approximations like those of `etid.likelihood.search`, and the deepest is the driver. None is left
-out on the way: the start that is behind after a hundred steps may be the one that ends deepest.
+approximations like those of `etid.likelihood.search`, and the deepest is the driver. The start that
+is behind after a hundred steps may be the one that ends deepest; one is left out only if the
+minimum of its approximation is above the deepest point.
 
 Z_th and a delay form a curved valley, along which a fit creeps. So the steps at the knots follow
 its curvature: there are a quarter as many.

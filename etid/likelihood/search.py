@@ -508,6 +508,8 @@ def _best(
 
     The harmonics at the knots tell starts apart, at a fifteenth of the time of all.
     """
+    if len(starts) == 1:
+        return starts[0]
     xp, used = namespace(starts), load.records.used[..., load.knots.index]
     objectives = load.at_knots(starts, at_knots).objective
     objectives = objectives + 0.5 * (load.rest(starts) ** 2).sum(-1)

@@ -86,7 +86,7 @@ def disturbances(
     xp, k = namespace(first), np.arange(1.0, bins + 1)
     place = xp.asarray(np.array(MAINS) / first)[:, None]
     ahead, back = (
-        as_complex(xp.sinc(of - k)) * _turned(np.pi * (of - k)) for of in (place, -place)
+        as_complex(xp.sinc(of - k)) * xp.exp(1j * np.pi * (of - k)) for of in (place, -place)
     )
     waves = xp.stack([ahead + back, 1j * (ahead - back)])
     found = xp.concatenate([waves.reshape(-1, bins), np.stack([1j / k, 1 / k**2])])
@@ -98,9 +98,12 @@ def are_seen(first: Float[AnyArray, ""] | float) -> Bool[AnyArray, ""]:
     return namespace(first).asarray(first < MAINS[0] / SHORTEST)
 
 
-def _turned(angle: Float[AnyArray, "*row bin"]) -> Complex[AnyArray, "*row bin"]:
-    xp = namespace(angle)
-    return xp.cos(angle) + 1j * xp.sin(angle)
+def disturbed(
+    of: Complex[AnyArray, "*row some bin"], first: Float[AnyArray, ""] | float
+) -> Complex[AnyArray, "*row more bin"]:
+    """The states of a record and, after them, those of hum and wander."""
+    xp, added = namespace(of, first), disturbances(of.shape[-1], first)
+    return xp.concatenate([of, added + xp.zeros((*of.shape[:-2], 1, 1))], -2)
 
 
 def _channels(of: AnyArray, axis: int = -2) -> list[AnyArray]:
@@ -168,13 +171,8 @@ class Transient:
 
     def disturbed(self, first: Float[AnyArray, ""] | float) -> "Transient":
         """The same of records with hum and wander, whose first bin is at this frequency [Hz]."""
-        xp, added = namespace(self.decays, first), disturbances(self.ends.shape[-1], first)
-
-        def beside(of: AnyArray) -> AnyArray:
-            more = added + xp.zeros((*of.shape[:-2], 1, 1))
-            return xp.concatenate([of, more], -2)
-
-        return dataclasses.replace(self, decays=beside(self.decays), ends=beside(self.ends))
+        of = {"decays": disturbed(self.decays, first), "ends": disturbed(self.ends, first)}
+        return dataclasses.replace(self, **of)
 
     def of(self, rows: np.ndarray) -> "Transient":
         """Those of some of the rows."""

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.signals.harmonics import DRIFT_DEGREE, namespace
 
 MAINS = (50.0, 60.0)  # [Hz]
+OF_PULSES = 2  # columns of `_pulses`
 MULTIPLES = 7  # higher multiples are a thousandth of the first in most laboratories
 
 
@@ -118,14 +119,14 @@ def _fit(
     """
     seconds = v.size / sample_rate
     bins, drifts = _near(sample_rate, periods, v.size)
+    if bins.size < 2 * MULTIPLES + DRIFT_DEGREE + OF_PULSES:
+        return None
     unit = sigma / math.sqrt(2 * v.size)  # standard deviation of the real part of a bin
     transform: Complex[np.ndarray, " all"] = np.fft.rfft(v) / v.size / unit
     others = np.concatenate([drifts, _pulses(v, transform, bins, periods)], axis=1)
     others = np.concatenate([np.real(others), np.imag(others)])
     others /= np.sqrt(np.sum(others**2, axis=0, keepdims=True))
     measured = np.concatenate([np.real(transform[bins]), np.imag(transform[bins])])
-    if measured.size < 2 * (2 * MULTIPLES + others.shape[1]):
-        return None
     drifting, before = _rest(others[:, :DRIFT_DEGREE], measured), _rest(others, measured)
     significant = 80.0
     if before - measured.size < max(significant, 0.05 * (drifting - before)):

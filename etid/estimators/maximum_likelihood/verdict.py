@@ -62,16 +62,13 @@ def judged(
     none = xp.zeros(values.shape[:-1], bool)
     rest = left(found.chi2, found.rrse)
     # A circuit that leaves more than is accepted competes with others without its δ.
-    deviance = xp.where(
-        found.approximate & (rest > accept), found.chi2 * support.terms, support.deviance
-    )
-    support = dataclasses.replace(support, deviance=xp.asarray(deviance))
+    alone = found.approximate & (rest > accept)
+    deviance = xp.where(alone, found.chi2 * support.terms, support.deviance)
     outside, contradicted = None, none
     if own:
         numbers = within(circuit, values, cov, shared_cov, own)
-        inside, cov, shared_cov, outside, deviance, contradicted = numbers
-        deviance = xp.asarray(support.deviance + deviance)
-        support = dataclasses.replace(support, deviance=deviance)
+        inside, cov, shared_cov, outside, more, contradicted = numbers
+        deviance = deviance + more
         errors = xp.sqrt(diagonal(cov)) / inside
         sound = xp.isfinite(inside).all(-1, keepdims=True)
         values = xp.where(sound, inside, values)
@@ -112,7 +109,7 @@ def judged(
         steps=found.points,
         method=method,
         remarks=xp.asarray(sum(xp.where(on, int(one), 0) for on, one in remarks)),
-        support=support,
+        support=dataclasses.replace(support, deviance=xp.asarray(deviance)),
         limits=_limits(circuit, own, outside),
         by_tolerance=found.effects,
     )
