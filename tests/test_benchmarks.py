@@ -17,6 +17,7 @@ from benchmarks import (
     amplitudes,
     control_loop,
     curves,
+    excitations,
     online,
     online_alarms,
     online_faults,
@@ -56,6 +57,9 @@ CASES = {
         "--drivers 2 --snr-db 60 --parts 0.03 --workers 1", "", "gain: deviation",
     ),
     "driver_order": ("--drivers 1 --snr-db 60 --orders 5 7 --data {}", "", "100 % right"),
+    "excitations": (
+        "--draws 2 --workers 1 --folder {}", "excitations.csv", "record current, held  fits 2",
+    ),
     "fuzz": ("--files 3 --kind csv --output {}/f.json", "f.json", "0 faults in 3 files"),
     "inexact": (
         "--drivers 1 --snr-db 60 --sizes 0.002 --driver-sizes 0.005 --lengths 1 --workers 1", "",
@@ -103,6 +107,7 @@ OWN = {"failure_map", "mutation", "scale", "speed", "speed_accuracy", "spice"}
 SMALLER = {
     amplitude_errors: {"SCENES": amplitude_errors.SCENES[:1], "POINTS": 2**9},
     amplitudes: {"FINER": (4,), "REPEATS": 1},
+    excitations: {"KINDS": ("bits",)},
     curves: {"LANES": (1, 2), "SAMPLES": (1_000,)},
     online_instruments: {"PULSES": 4},
     online_faults: {"LANES": 4, "DRIVERS": 1, "SNR": (60.0,)},

@@ -13,6 +13,7 @@ from etid.recordings.faults import covariance_of
 from etid.recordings.recording import Recording, Samples, quietly
 from etid.recordings.remarks import Remark
 from etid.signals.averaging import Differing, differing_aliases, exact_spacing, without_aliases
+from etid.signals.bins import are_coherent
 from etid.signals.disturbances import Joint, Shifts, disturbed, kept
 from etid.signals.drift import clocks_apart, largest_drift
 from etid.signals.filtering import TAPS
@@ -301,7 +302,10 @@ class Inspection:
     @functools.cached_property
     def is_flat(self) -> Bool[np.ndarray, "recording 2"]:
         """Whether `v_th` and `v_out` carry no signal."""
-        return faults.flat(self.spans, self.covariance, self.sigma)
+        found = faults.flat(self.spans, self.covariance, self.sigma)
+        for row in np.flatnonzero(found.any(1) & (self.spans > 0).all(1)):
+            found[row] &= not are_coherent(self.recorded[row])
+        return found
 
     @functools.cached_property
     def clocks_differ(self) -> Bool[np.ndarray, " recording"]:

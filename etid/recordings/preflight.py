@@ -125,6 +125,7 @@ class Inspected:
             np.asarray(self.coarse),
             self.is_held or (periods[0] > 0 and self.has_no_aliases),
             self.has_current,
+            self.is_held,
         )
 
     @property

@@ -8,7 +8,8 @@ They are k fs/N of a record of N samples, with k = 1 … up to `ALIASED` of the 
 signal without rest, such as a random sequence, looks like noise then. But in a few neighbouring
 bins Y = G X + T with smooth G and T, and what polynomials for both leave is var Y + |G|² var X (the
 local polynomial method of Pintelon and Schoukens, 2012, chapter 7). If this is much less than the
-noise that the records seem to have, it counts, half of it for each record.
+noise that the records seem to have, it counts, half of it for each record, or all for `v_out` if
+the other one is a command.
 
 **Aliases** of the edges of pulses fall on all bins, as on the harmonics of a period of whole
 samples (`etid.signals.harmonics`, which says how their size follows from the record). The band ends
@@ -42,7 +43,7 @@ LAST, STEPS, SURE = 0.45, 0.015, 5.0
 
 LOCAL, DEGREE = 32, 2  # neighbouring bins, and degree of the polynomials of G and of T
 STRONG = 10.0  # power of a signal relative to the noise, from which on both records share the noise
-SEEMING = 2.0  # noise of both records relative to what polynomials leave, above which this counts
+SEEMING = 1.2  # noise of both records relative to what polynomials leave, from which on this counts
 
 
 class Bins(NamedTuple):
@@ -66,6 +67,7 @@ def bins(
     coarse: Float[np.ndarray, "2"],
     ended: bool,
     of_current: bool,
+    commanded: bool = False,
 ) -> Bins:
     """The bins of two records.
 
@@ -78,12 +80,13 @@ def bins(
         coarse: Step of a converter that exceeds the noise; else 0.
         ended: Whether the spectra surely end below half the sample rate.
         of_current: Whether the first record is a current.
+        commanded: Whether the first record is a command, without noise.
     """
     size = both.shape[-1]
     transform, count = np.asarray(harmonics_of(both, 1)), math.ceil(ALIASED * size)
     variance, of_ends = _noise(both, noise, transform.shape[-1])
     if noise is None:
-        variance = _of_both(transform, variance)
+        variance = _of_both(transform, variance, commanded)
     variance = np.maximum(variance, least[:, None] ** 2 / size)
     for row in np.flatnonzero(coarse):
         variance[row] = rounding_variance(both[row], float(coarse[row]), 1, size)
@@ -117,31 +120,60 @@ def _noise(
     return power * (samples / size), ends
 
 
+def are_coherent(both: Float[np.ndarray, "2 time"]) -> bool:
+    """Whether the first of two records explains most of the second, although both look like noise.
+
+    So do white noise, and random numbers that a converter holds.
+    """
+    transform = np.asarray(harmonics_of(both, 1))
+    if transform.shape[-1] < LOCAL:
+        return False
+    left, explained, _ = _locally(transform)
+    return bool(np.median(explained / (LOCAL * left)) > 1.0)
+
+
+def _locally(
+    both: Complex[np.ndarray, "2 bin"],
+) -> tuple[Float[np.ndarray, " group"], Float[np.ndarray, " group"], Float[np.ndarray, " group"]]:
+    """What polynomials for G and T leave of Y = G X + T in each group of bins, for each bin.
+
+    Also the squares that G X explains beside T, and |G|².
+    """
+    groups = both.shape[-1] // LOCAL
+    both = both[:, : groups * LOCAL].reshape(2, groups, LOCAL)
+    powers = np.linspace(-1, 1, LOCAL) ** np.arange(DEGREE + 1)[:, None]
+    of_t = np.linalg.qr(powers.T)[0]
+    columns = both[0][:, None] * powers
+    columns = columns - (columns @ of_t) @ of_t.T
+    x, y = both - (both @ of_t) @ of_t.T
+    basis = np.linalg.qr(columns.swapaxes(-1, -2))[0]
+    left = y - (basis @ (basis.conj().swapaxes(-1, -2) @ y[..., None]))[..., 0]
+    found = power(left).sum(-1) / (LOCAL - 2 * (DEGREE + 1) - 1)  # the mean of its inverse is right
+    squares = power(x).sum(-1)
+    gain = power((x.conj() * y).sum(-1)) / squares**2
+    return found, gain * squares, gain
+
+
 def _of_both(
-    both: Complex[np.ndarray, "2 bin"], variance: Float[np.ndarray, "2 bin"]
+    both: Complex[np.ndarray, "2 bin"], variance: Float[np.ndarray, "2 bin"], commanded: bool
 ) -> Float[np.ndarray, "2 bin"]:
     """The variances, or those by what Y = G X + T leaves with polynomials for G and T."""
     groups = both.shape[-1] // LOCAL
     if groups == 0:
         return variance
-    x, y = both[:, : groups * LOCAL].reshape(2, groups, LOCAL)
-    powers = np.linspace(-1, 1, LOCAL) ** np.arange(DEGREE + 1)[:, None]
-    columns = np.concatenate(
-        [x[:, None] * powers, 1.0 * np.broadcast_to(powers, (groups, *powers.shape))], 1
-    )
-    basis = np.linalg.qr(columns.swapaxes(-1, -2))[0]
-    left = y - (basis @ (basis.conj().swapaxes(-1, -2) @ y[..., None]))[..., 0]
-    rest = LOCAL - 2 * (DEGREE + 1)
-    found = power(left).sum(-1) / (rest - 1)  # the mean of its inverse is right
-    explained = np.maximum(power(y).sum(-1) - LOCAL / rest * power(left).sum(-1), 0.0)
-    gain = explained / power(x).sum(-1)
+    found, explained, gain = _locally(both)
     seeming = variance[:, : groups * LOCAL].reshape(2, groups, LOCAL).mean(-1)
-    if not np.median((seeming[1] + gain * seeming[0]) / found) > SEEMING:
+    much = (seeming[1] + gain * seeming[0]) / found
+    freedom = groups * (LOCAL - 2 * (DEGREE + 1))
+    if not np.median(much) > SEEMING + SURE / math.sqrt(freedom):
         return variance
     signal = explained > STRONG * LOCAL * found
-    of_x = np.where(signal, 0.5 * found / np.where(signal, gain, 1.0), seeming[0])
+    share = 1.0 if commanded else 0.5  # of v_out
+    of_x = np.where(signal, (1 - share) * found / np.where(signal, gain, 1.0), seeming[0])
     at = np.minimum(np.arange(both.shape[-1]) // LOCAL, groups - 1)
-    return np.stack([of_x, np.where(signal, 0.5, 1.0) * found])[:, at]
+    # Of a short record the first bins leave more, because G and T bend there.
+    less = np.stack([of_x, np.where(signal, share, 1.0) * found])[:, at]
+    return np.where((much > 1)[at], less, variance)
 
 
 def _tapered(both: Float[np.ndarray, "2 time"]) -> Complex[np.ndarray, "2 bin"]:
