@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 import etid
+from benchmarks import perturbed_study as lab
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.circuits.directions import FALSE_ALARMS
 from etid.identify import changes
@@ -339,3 +340,12 @@ def test_noise_of_bands_is_that_of_their_second_differences():
     # The mean over the periods is taken from each, which is one degree of freedom less.
     [found] = _noise_of_single(gain - gain.mean(axis=1, keepdims=True), weight, np.array([19_999]))
     assert found == pytest.approx(0.5, rel=0.02)  # 80 000 differences know it to 0.5 %
+
+
+@pytest.mark.parametrize(("number", "path"), [(4, "damp"), (9, "dry"), (13, "damp")])
+def test_aliases_of_a_card_without_a_filter_are_no_change(number, path):
+    """With a clock 50 ppm fast, six periods are cut at six phases: those of fs + f show, too."""
+    change = lab.lasting(20_000, lab.instrument("multifunction_card"))
+    study = change(lab.undisturbed(number, 60.0)).recordings()
+    driver = etid.identify_driver(list(study.calibrations.recordings()))
+    assert etid.identify_skin(study[path], driver).verdict == "successful"

@@ -19,9 +19,10 @@ moves. Its projection on X̄ Ȳ, weighted by the noise, is the change of the log
 
 **Aliases** rotate by e^(−j2πδ) if a cut is late by a fraction δ of a sample; the rest does not.
 `turn` is the direction t of this rotation. A deviation in this direction proves nothing: only
-(1 − t tᴴ) η counts. Where the power A² of the aliases is known (`etid.signals.averaging`), those of
-fs + f, which rotate by e^(j2πδ), and those of twice the sample rate have directions, too, and η is
-weighted as if they were noise: by (1 + Σ ρ t tᴴ)⁻¹, ρ = n A²/σ² in a band of n harmonics.
+(1 − t tᴴ) η counts. Without a filter, those of fs + f show, too, which rotate by e^(j2πδ). Where
+the power A² of the aliases is known (`etid.signals.averaging`), those of twice the sample rate have
+directions besides, and η is weighted as if they were noise: by (1 + Σ ρ t tᴴ)⁻¹, ρ = n A²/σ² in a
+band of n harmonics.
 """
 
 import math
@@ -241,26 +242,46 @@ def _of_rows(
 
 
 def _directions(
-    of: _Rows, late: Float[np.ndarray, "lane period"]
+    of: _Rows, own: Deviations
 ) -> tuple[
     Complex[np.ndarray, "lane direction period"],
     Complex[np.ndarray, "lane band direction direction"],
 ]:
-    """`Repeats.turn` and `Repeats.removed` for cuts with these delays [samples]."""
-    turns, basis = rotations(late)
+    """`Repeats.turn` and `Repeats.removed`."""
+    turns, basis = rotations(own.late)
     count, layout, known = basis.shape[2], of.layout, of.aliased
-    basis[~known, :, 1:] = 0
-    removed = np.zeros((len(late), layout.middle.size, count, count), complex)
-    removed[:, :, 0, 0] = of.aliases() & np.any(basis, axis=(1, 2), keepdims=True)[:, 0]
+    places = of.aliases()
+    basis[~known, :, 2:] = 0
+    basis[~(known | _shows(own, basis[..., 1], places)), :, 1:] = 0
+    removed = np.zeros((len(basis), layout.middle.size, count, count), complex)
+    for direction in range(2):
+        on = np.any(basis[..., direction], axis=1, keepdims=True)
+        removed[..., direction, direction] = places & on
     if known.any():
         place = layout.middle / (2 * np.pi)
         y = of.inspection.differing.of_out.take(of.rows[known]).at(place)[:, :2]
         noise = of.in_bands(of.inspection.variance[:, 1])[known]
-        ratio = np.repeat(y * layout.number / (late.shape[1] * noise)[:, None], 2, axis=1)
+        ratio = np.repeat(y * layout.number / (own.late.shape[1] * noise)[:, None], 2, axis=1)
         inside = basis[known].conj().swapaxes(1, 2) @ turns[known]
         of_aliases = np.einsum("rak,rkb,rck->rbac", inside, ratio, inside.conj())
         removed[known] = np.eye(count) - np.linalg.inv(np.eye(count) + of_aliases)
     return basis.swapaxes(1, 2), removed
+
+
+def _shows(
+    own: Deviations,
+    direction: Complex[np.ndarray, "lane period"],
+    places: Bool[np.ndarray, "lane band"],
+) -> Bool[np.ndarray, " lane"]:
+    """Whether deviations in a direction exceed the noise, in bands that may have aliases.
+
+    Aliases of fs + f do so without a filter. Of four periods or fewer, their direction and that of
+    fs − f leave too little.
+    """
+    along = (direction.conj()[:, None] @ own.gain)[:, 0]
+    squares = np.where(places, power_of(along) / (2 * own.variance), 0.0).sum(1)
+    count = np.count_nonzero(places, axis=1)
+    return (squares > count + SURE * np.sqrt(count)) & (own.gain.shape[1] > 4)
 
 
 def _of_currents(of: _Rows, own: Deviations, other: Deviations) -> Repeats:
@@ -301,7 +322,7 @@ def _joined(
     unloaded_variance: Float[np.ndarray, " lane"],
 ) -> Repeats:
     """The result, with the directions of the aliases."""
-    turn, removed = _directions(of, own.late)
+    turn, removed = _directions(of, own)
     count, rate = len(of.rows), of.inspection.sample_rate
     frequency = np.repeat(of.layout.middle[None] * (rate / (2 * np.pi)), count, axis=0)
     parts = own.gain, own.power, smooth, own.variance, turn, removed
