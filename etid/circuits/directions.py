@@ -363,7 +363,12 @@ DIRECTIONS: Mapping[str, Direction] = {
         looks=("an inductance in series with the load",),
     ),
     # A pole at the end of the band in one channel; what it takes away to first order is a delay.
-    "slow voltage": Direction("factor", _slow, verdict="misfit"),
+    "slow voltage": Direction(
+        "factor",
+        _slow,
+        verdict="misfit",
+        looks=("a low-pass of one channel (state it as v_out_filter or current_filter)",),
+    ),
     # Behind a measured current, amplifiers that show less of their peaks.
     "compressed current": Direction(verdict="misfit"),
     "compressed voltage": Direction(verdict="misfit"),
