@@ -15,10 +15,11 @@ from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.rows import loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
-from etid.likelihood.approximate import with_delta
+from etid.likelihood.approximate import departs, with_delta
 from etid.likelihood.discrepancy import FUNCTIONS, Discrepancy, kernels, nodes, splines
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import VoltageAndCurrent
+from etid.likelihood.noise import is_smooth
 from etid.likelihood.restricted import LEVELS, restricted
 from etid.likelihood.search import Anew, Near, minimum
 from etid.likelihood.starts import starts
@@ -365,3 +366,23 @@ def test_a_change_that_is_the_cause_explains_it():
     found = restricted(rows, unit, none, none, np.array([size]), HARMONICS)
     assert found.ratio[0, 0] > 12 > found.ratio[0, 1]
     assert found.explained[0, 0] > 0.9 > found.explained[0, 1]
+
+
+def test_what_is_not_smooth_is_no_error_of_the_gain():
+    """Edges of a current that are recorded late by parts of a sample: no δ, and no long search."""
+    rng, f = np.random.default_rng(0), 60.0 * np.arange(1, 1500)
+    edges = np.exp(-2j * np.pi * np.outer(f, [1e-3, 1.6e-3, 6e-3, 6.6e-3]))
+    late = np.exp(-2j * np.pi * f[:, None] * 1e-6 * rng.standard_normal(4))
+    signs, size = np.array([1, -1, -1, 1]), 0.06 / (2j * np.pi * f) / (1 + (f / 60e3) ** 8)
+    i, other = (size * (of @ signs) for of in (edges, edges * late))
+    wave = np.exp(2j * np.pi * np.outer(np.arange(10_000) / 200e3, f))
+    both = 2 * (wave @ np.stack([i, other * np.asarray(DRY.response(f))], 1)).real.T
+    both += 1e-4 * np.abs(both).max(-1, keepdims=True) * rng.standard_normal(both.shape)
+    one = etid.Recording(current=both[0], v_out=both[1], sample_rate=200e3, pulse_rate=60.0)
+    lane = Harmonics.of(Inspected.of(one))
+    known = known_of(lane, MEASURED_CURRENT, False, MAXIMUM_LIKELIHOOD)
+    load = loads_of([lane], source_of(known), DRY, None, None)
+    near = minimum(load, starts(load)).near
+    assert is_smooth(near.condensed.part, load.gains.exact).all()
+    assert not departs(load, near).any()
+    assert etid.identify_skin(one, throw=False).verdict == "misfit"

@@ -30,7 +30,7 @@ from etid.signals.knots import above_noise, banded
 from etid.signals.transfer import AnyArray, Rational, power
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
-BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
+BAND = np.linspace(0.001, 1.0, 400)  # of the highest bin in use; the source must be passive there
 UNWANTED = 1e3  # added to the cost of a start that did not converge; larger than any cost
 # Two sections closer than `SPLIT` in ln ω and ln ζ are one section, split by noise. Their gains
 # grow with opposite signs along a curved valley, so the curvature at one point is not informative.
@@ -93,7 +93,7 @@ def _best(
     least = driver.minimum(model, np.pad(q, ((0, 0), (0, model.tolerances.size))))
     sources = jax.tree.map(lambda *of: np.stack(of), *map(model.source_of, least.q))
     kept = model.parameters(least.q[0]).size
-    passive = _is_passive(sources, inverse(least.matrix)[:, :kept, :kept], rate)
+    passive = _is_passive(sources, inverse(least.matrix)[:, :kept, :kept], spectra)
     costs = _cost(sources, driver.cost(model, least), passive)
     start = int(np.argmin(costs + np.where(least.settled, 0.0, UNWANTED)))
     least = driver.Minimum(*(of[start] for of in least._replace(points=least.points + steps)))
@@ -142,7 +142,7 @@ def from_harmonics(
             calibration = _compared(model, near, linear)
     kept = model.parameters(least.q).size
     cov = linear.first(model.unknowns).covariance()[:kept, :kept]  # at these errors
-    passive = _is_passive(model.source, cov, rate)
+    passive = _is_passive(model.source, cov, spectra)
     rest = left(chi2, rrse)
     missed = rest > accept if inexact else misses(chi2, rrse)
     faults = _faults(chi2, missed, least.settled, calibration, passive, wrong)
@@ -174,10 +174,11 @@ def from_harmonics(
 def _is_passive(
     source: SourceImpedance,
     cov: Float[AnyArray, "*start parameter parameter"],
-    rate: Float[AnyArray, ""],
+    spectra: Spectrum,
 ) -> Bool[AnyArray, "*start"]:
     """Whether Re Z_th is nowhere negative by more than its standard errors allow."""
-    xp, frequency = namespace(cov), BAND * rate
+    xp = namespace(cov)
+    frequency = BAND * xp.where(spectra.selected, spectra.frequency, 0.0).max()
     z_th, slopes = source.slopes(source.vector(), frequency)
     slope = slopes.real
     error = xp.sqrt(xp.maximum((slope * (cov @ slope)).sum(-2), 0.0))

@@ -6,8 +6,7 @@ from jaxtyping import Float
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
 from etid.identify.posterior import Known
-from etid.likelihood.approximate import approximated
-from etid.likelihood.noise import is_smooth
+from etid.likelihood.approximate import approximated, departs
 from etid.likelihood.search import minimum
 from etid.likelihood.starts import starts
 from etid.precision import array_function, one_thread
@@ -28,7 +27,7 @@ def discrepancy(fit: Fit, lane: Harmonics, known: Known) -> Float[np.ndarray, " 
     load = loads_of([lane], *driver)
     every = starts(load)
     least = minimum(load, every, float(known.driver.aside))
-    if not is_smooth(least.near.condensed.part, load.gains.exact).any():
+    if not departs(load, least.near).any():
         return np.zeros(load.records.x.shape[-1])
     of = approximated(load, least.near, every[0]).load.gains.discrepancy
     assert of is not None

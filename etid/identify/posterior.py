@@ -36,8 +36,7 @@ from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.fitting import fits_of, is_shared, known_of
-from etid.likelihood.approximate import approximated
-from etid.likelihood.noise import is_smooth
+from etid.likelihood.approximate import approximated, departs
 from etid.likelihood.search import ROWS, Load, minimum
 from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.preflight import Inspected
@@ -96,7 +95,7 @@ class Minimum(NamedTuple):
         rest = np.zeros(load.gains.exact - load.gains.elements)
         start = np.concatenate([np.log(circuit.values()), rest, load.gains.source.mean])
         found = minimum(load, start[None, None])
-        if fit.usable and is_smooth(found.near.condensed.part, load.gains.exact).any():
+        if fit.usable and departs(load, found.near).any():
             of = approximated(load, found.near, start[None])
             load, found = of.load, of.least
         rows, q = found.near.jacobian[0], found.q[0]

@@ -16,10 +16,13 @@ from jaxtyping import Bool, Complex, Float
 
 from etid.likelihood import scores
 from etid.likelihood.discrepancy import POWERS, Discrepancy, kernels, splines
-from etid.likelihood.restricted import ROUNDS, Restricted, restricted
+from etid.likelihood.linear import taken
+from etid.likelihood.noise import SMOOTH, is_smooth
+from etid.likelihood.restricted import ROUNDS, SMALLEST, Restricted, restricted
 from etid.likelihood.search import Load, Minimum, Near, minimum, of_load, select
 
 ORDINARY = 2 * POWERS.size + 1  # number of the kernel to begin with
+ROUGH = 0.05  # part of the squares, which no δ explains; of smooth errors to 3 % it is 1e-3
 FAR = 5e-3  # of the signal; the minimum of a circuit that leaves more may lie far away
 # Likelihood ratio, from which on a change explains what a circuit leaves: of 200 smooth functions
 # that have no name, the largest of all changes had 10.
@@ -71,6 +74,29 @@ def approximated(load: Load, near: Near, start: Float[np.ndarray, "row q"]) -> A
         before, of = of, with_delta(load, found.covariance)
         least = minimum(of, _nearest(of, before, near.q)[None])
     return Approximation(of, least, explains)
+
+
+def departs(load: Load, near: Near) -> Bool[np.ndarray, " row"]:
+    """Whether circuits leave more than noise that some δ explains, near their minima without δ.
+
+    No δ explains edges of a current that were not recorded where they are, or spikes.
+    """
+    smooth = is_smooth(near.condensed.part, load.gains.exact)
+    rows = np.flatnonzero(smooth)
+    if rows.size == 0:
+        return smooth
+    load, near = load.of(rows), taken(near, rows)
+    terms = near.condensed.part
+    made = np.concatenate([_exact_rows(load, near.jacobian), _by_node(load, near)], 1)
+    size = np.sqrt((made**2).sum(-1, keepdims=True))
+    made = np.nan_to_num(made / np.where(size > 0, size, 1.0))
+    products = made @ made.swapaxes(-1, -2) + SMALLEST * np.eye(made.shape[1])
+    by_terms = made @ terms[..., None]
+    explained = (by_terms * np.linalg.solve(products, by_terms)).sum((-2, -1))
+    squares = (terms**2).sum(-1)
+    rough = squares - explained - SMOOTH * (terms != 0).sum(-1)
+    smooth[rows] = rough < ROUGH * squares
+    return smooth
 
 
 def _left(load: Load, near: Near) -> Float[np.ndarray, " row"]:
@@ -129,23 +155,27 @@ def _restricted(
     own = slice(gains.exact, gains.owned)
     terms = terms - (jacobian[:, own] * near.q[:, own, None]).sum(1)
     harmonics = load.records.x.shape[-1]
-    at = splines(harmonics)[:, load.knots.index]
-    unit = np.eye(outputs)[:, None, :, None] * at[:, None, :]  # output, node, output, knot
-    unit = unit.reshape(-1, outputs, at.shape[-1])
-    of_gains, states = near.slopes.gains[:, None] * unit, of_load(load, near)
-    both = np.concatenate([of_gains, 1j * of_gains], 1)
-    if states is not None:
-        states = np.concatenate([states[:, None] * unit, 1j * states[:, None] * unit], 1)
-    rows = near.condensed.rows(both, states)
     of_changes = near.condensed.rows(np.concatenate(list(changes.values()), 1))
     known = np.concatenate([_exact_rows(load, jacobian), terms[:, None], of_changes], 1)
     precision = without_delta(load, 1 / load.width**2)
     pull = precision * without_delta(load, near.q - load.centre)
     precision = np.broadcast_to(precision, pull.shape)
-    of = known, rows, precision, pull, left
+    of = known, _by_node(load, near), precision, pull, left
     # Numbers of a search that failed are none.
     known, unknown, precision, pull, left = (np.nan_to_num(one) for one in of)
     return restricted(known, unknown, precision, pull, left, harmonics, 2 * outputs)
+
+
+def _by_node(load: Load, near: Near) -> Float[np.ndarray, "row node part"]:
+    """By δ at the nodes: real parts of each output, then imaginary ones."""
+    outputs = load.gains.outputs.count
+    at = splines(load.records.x.shape[-1])[:, load.knots.index]
+    unit = np.eye(outputs)[:, None, :, None] * at[:, None, :]  # output, node, output, knot
+    unit = unit.reshape(-1, outputs, at.shape[-1])
+    gains, states = near.slopes.gains[:, None] * unit, of_load(load, near)
+    if states is not None:
+        states = np.concatenate([states[:, None] * unit, 1j * states[:, None] * unit], 1)
+    return near.condensed.rows(np.concatenate([gains, 1j * gains], 1), states)
 
 
 def _exact_rows(

@@ -206,7 +206,7 @@ def minimum(model: Calibrations, start: Float[AnyArray, "*row q"]) -> Minimum:
         points: AnyArray,
     ) -> _State:
         of = found[:2], last, better, reduced, idle
-        to = decided(near.q, objective, objective / model.terms, *of)
+        to = decided(near.q, objective, objective / model.terms, *of, not model.spectra.whole)
         moves = ~to.settled & xp.isfinite(objective)
         going = to.target, to.trial, to.settled, to.idle, points + 1, moves
         return _State(near, objective, found, *going)

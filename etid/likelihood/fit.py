@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from etid.circuits.directions import DIRECTIONS, ON_LOADS, SEEN
 from etid.likelihood import scores
-from etid.likelihood.approximate import approximated, without_delta
+from etid.likelihood.approximate import approximated, departs, without_delta
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.linear import diagonal, inverse, replaced, taken
 from etid.likelihood.noise import excess, is_smooth, misses, shows_hum
@@ -102,8 +102,8 @@ def fit(
     if namespace(least.q) is not np or not inexact:
         return found
     smooth = is_smooth(least.near.condensed.part, load.gains.exact)
-    if smooth.any():
-        rows = np.flatnonzero(smooth)
+    if smooth.any() and (departing := departs(load, least.near)).any():
+        rows = np.flatnonzero(departing)
         of = taken(least, rows), starts[0, rows], taken(found, rows)
         return replaced(found, rows, _approximated(load.of(rows), *of))
     return found

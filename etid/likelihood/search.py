@@ -45,6 +45,8 @@ BEFORE = 0.05  # [standard errors] largest distance to the minimum before the la
 # [standard errors] An approximation errs by a tenth: if a point so near is no better, the best
 # point is the minimum.
 NO_BETTER = 0.3
+# The same where states make it err by more, of a point so close relative to the step.
+ROUGH, CLOSE = 1.0, 2.0**-7
 IDLE = 3  # points in a row with a reduction below the rounding errors of ½ Σ r²
 ROUNDING = 1e-6  # of ½ Σ r²
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
@@ -443,7 +445,8 @@ def _search(
         better = reduced >= 0
         kept = select(better, near, state.near)
         reduced = xp.where(state.points > 0, reduced, 0.0)
-        found = _next(load, at_knots, kept, state.trial, better, reduced, state.idle)
+        before = state.target, state.promised
+        found = _next(load, at_knots, kept, state.trial, better, reduced, state.idle, before)
         return found._replace(points=state.points + 1)
 
     def goes_on(state: _State) -> Bool[AnyArray, "*row"]:
@@ -458,7 +461,8 @@ def _search(
             near = Near.of(load, at_knots, near.q + aside * delays)
         none, better = np.zeros(starts.shape[1:-1], int), np.isfinite(near.objective)
         nothing = np.zeros_like(near.objective)
-        state = _next(load, at_knots, near, near.q, better, nothing, none)
+        nowhere = near.q, nothing
+        state = _next(load, at_knots, near, near.q, better, nothing, none, nowhere)
         while (live := np.flatnonzero(goes_on(state))).size:
             if live.size == len(none):
                 state = step(load, at_knots, state)
@@ -547,19 +551,24 @@ def _next(
     better: Bool[AnyArray, "*row"],
     reduced: Float[AnyArray, "*row"],
     idle: Int[AnyArray, "*row"],
+    before: tuple[Float[AnyArray, "*row q"], Float[AnyArray, "*row"]],
 ) -> _State:
-    """Where the search goes from the best point; `better` says whether the last one is the best."""
+    """Where the search goes from the best point.
+
+    `better` says whether the last one is the best. If not, the minimum of the approximation and
+    what it promises are those of `before`.
+    """
     xp, best, scale = namespace(near.q), near.q, near.objective / load.records.terms
     here = _equations(load, near, near.slopes, best)
     newton = here.step()
     promised = here.promised(newton)
     close = promised <= BEFORE**2 * scale
     target = xp.where(close[..., None], best + newton, best)
-    goes = ~close & xp.isfinite(promised)
+    goes = better & ~close & xp.isfinite(promised)
     if xp is not np or goes.any():
         target, left = _followed(load, at_knots, near, here, target, goes, promised)
         promised = xp.where(goes, here.objective - left, promised)
-    found = target, promised
+    found = xp.where(better[..., None], target, before[0]), xp.where(better, promised, before[1])
     going = decided(best, near.objective, scale, found, last, better, reduced, idle)
     trial, target, promised, settled, idle = going
     return _State(trial, near, target, promised, settled, idle, xp.ones_like(idle))
@@ -600,6 +609,7 @@ def decided(
     better: Bool[AnyArray, "*row"],
     reduced: Float[AnyArray, "*row"],
     idle: Int[AnyArray, "*row"],
+    rough: bool = False,
 ) -> Decision:
     """The next point, and whether the search ends.
 
@@ -612,9 +622,13 @@ def decided(
         better: Whether it is the best.
         reduced: By how much it is better.
         idle: Points in a row before it that have brought nothing.
+        rough: Whether the approximation errs by more, as it does for the states of a driver.
     """
     xp, (target, promised) = namespace(best), found
     stays = ~better & (promised <= NO_BETTER**2 * scale)
+    if rough:
+        close = (xp.abs(last - best) <= CLOSE * xp.abs(target - best)).all(-1)
+        stays = stays | (~better & close & (promised <= ROUGH**2 * scale))
     target = xp.where(stays[..., None], best, target)
     promised = xp.where(stays, 0.0, promised)
     idles = xp.maximum(xp.abs(reduced), promised) <= ROUNDING * objective
