@@ -425,3 +425,26 @@ def test_skin_that_falls_with_its_current_is_identified_behind_a_driver(corner):
 def test_a_small_chi2_excuses_no_large_residual(chi2, rrse, much):
     """At a large gain the noise of V_th would explain any residual."""
     assert leaves_much(chi2, rrse) is much
+
+
+def test_parts_of_a_period_are_refused():
+    """Harmonic balance needs the whole period."""
+    at = np.arange(2500) / SAMPLE_RATE
+    load = np.asarray(etid.SkinRC().response(PULSE_RATE * np.arange(1, 400)))
+    lines = np.fft.rfft(pulses(np.arange(3333) / (3333 * PULSE_RATE)))
+    lines[1:400] *= load
+    lines[[0, *range(400, lines.size)]] = 0
+    wave = np.resize(np.fft.irfft(lines, 3333), at.size)
+    rng = np.random.default_rng(0)
+    parts = [
+        etid.Recording(
+            current=size * (pulses(at) + 1e-3 * rng.standard_normal(at.size)),
+            v_out=size * (wave + 1e-3 * wave.std() * rng.standard_normal(at.size)),
+            sample_rate=SAMPLE_RATE,
+            pulse_rate=PULSE_RATE,
+            path=str(size),
+        )
+        for size in (1e-4, 1e-3)
+    ]
+    with pytest.raises(etid.IdentificationError, match="not_periodic"):
+        etid.identify_amplitudes(parts)

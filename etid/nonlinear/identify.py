@@ -34,7 +34,7 @@ from etid.nonlinear.fit import fit_amplitudes
 from etid.nonlinear.response import Recorded, with_filter
 from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.errors import RecordingError
-from etid.recordings.preflight import Inspected
+from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
@@ -152,6 +152,7 @@ def identify_amplitudes(
                 "command that a converter holds; identify each recording alone"
             )
         _, name = plan(options, one, feed)
+        name = name or preflight(one, periodic=True)
         if name is not None:
             fit = failed_fit(name, options, METHOD)
             return usable(one.recording, fit) if throw else fit
