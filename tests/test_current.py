@@ -266,3 +266,5 @@ def test_a_current_that_its_converter_clips_is_refused(skin):
         assert preflight(Inspected.of(record)) == verdict
         ranged = record.replace(adc_range=(-1e4, 1e4))  # that of the voltages
         assert preflight(Inspected.of(ranged)) == verdict
+    with pytest.raises(etid.IdentificationError, match="may rest at its value: state `hold`"):
+        etid.identify_skin(clipped)

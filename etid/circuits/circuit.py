@@ -111,7 +111,7 @@ class AbstractCircuit(_Titled, Overviewed, Module):
     @classmethod
     def names(cls) -> tuple[str, ...]:
         """Parameter names, in the order of `log_values`."""
-        return tuple(f.name for f in dataclasses.fields(cls))
+        return _names(cls)
 
     @classmethod
     def units(cls) -> dict[str, str]:
@@ -373,6 +373,11 @@ def _plain(of: Any, kind: Any = None) -> Any:
     """An array of NumPy, unless JAX traces it."""
     xp = jnp if isinstance(of, jax.core.Tracer) else np
     return xp.asarray(of, kind)
+
+
+@functools.cache  # a fit asks a thousand times
+def _names(kind: type[AbstractCircuit]) -> tuple[str, ...]:
+    return tuple(f.name for f in dataclasses.fields(kind))
 
 
 @functools.cache

@@ -35,7 +35,10 @@ from etid.results.verdicts import message, verdict
 TOGETHER = 640_000  # samples that are inspected together; their arrays take tens of MB
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 # Verdicts whose message says more of a recording.
-EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
+EXPLAINED = (
+    *("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples"),
+    "saturated",
+)
 T = TypeVar("T")
 
 Load = Callable[[int], tuple[Recording, AbstractFeed]]
@@ -210,6 +213,8 @@ def explained(seen: Inspected, name: str) -> str:
         found = why_misaligned(seen)
     elif name == "wrong_unit":
         found = why_implausible(seen.by_current or seen)
+    elif name == "saturated" and seen.has_current:
+        return f"{message(name)} A current that is commanded may rest at its value: state `hold`."
     elif name in ("flat", "nonfinite_samples"):
         found = f"The fault is in {' and '.join(_faulty(seen, name))}."
     return f"{found} {message(name)}".strip()
