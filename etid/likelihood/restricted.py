@@ -7,9 +7,11 @@ Near a minimum the terms of a fit are linear in its parameters q and in δ at th
 The size, the length and the power of δ are seen by the restricted likelihood, in which the
 parameters are integrated over (Patterson and Thompson 1971, Biometrika 58),
 
-    −2 ln p = ln |C| + ln |Jᵀ C⁻¹ J + P| + yᵀ (C⁻¹ − C⁻¹ J (Jᵀ C⁻¹ J + P)⁻¹ Jᵀ C⁻¹) y,
+    −2 ln p = ln |1 + κ Uᵀ M U| + yᵀ (M − M U (κ⁻¹ + Uᵀ M U)⁻¹ Uᵀ M) y,
 
-    C = 1 + U κ Uᵀ.
+    M = 1 − J (Jᵀ J + P)⁻¹ Jᵀ,
+
+with the precision P of their priors.
 
 The covariance of δ is the mean over sizes, lengths and powers, weighted by it. The largest alone
 would be too small, because a smooth function tells of its own size by a few numbers only.
@@ -73,71 +75,57 @@ def restricted(
         harmonics: Number of harmonics.
         parts: Number of real and imaginary parts of δ.
     """
-    count = precision.shape[-1]
-    whole = rows @ rows.swapaxes(-1, -2)
+    count, known = precision.shape[-1], rows.shape[1]
+    products = np.concatenate([rows, nodes], 1)
+    products = products @ products.swapaxes(-1, -2)
     own = np.arange(count)
-    whole[:, own, own] += precision
-    whole[:, own, count] += pull
-    whole[:, count, own] += pull
-    inner, cross = nodes @ nodes.swapaxes(-1, -2), nodes @ rows.swapaxes(-1, -2)
+    products[:, own, own] += precision
+    products[:, own, count] += pull
+    products[:, count, own] += pull
+    whole = diagonal(products)[:, None, count + 1 : known]
+    products, known = _without(products, count), known - count  # the terms and the changes
     every, root = kernels(harmonics), np.kron(np.eye(parts), roots(harmonics))
-    eigen, turn = np.linalg.eigh(root.swapaxes(-1, -2) @ inner[:, None] @ root)
-    eigen = np.maximum(eigen, 0.0)
-    told = turn.swapaxes(-1, -2) @ (root.swapaxes(-1, -2) @ cross[:, None])
+    back = root.swapaxes(-1, -2)
+    eigen, turn = np.linalg.eigh(back @ products[:, None, known:, known:] @ root)
+    eigen = np.maximum(eigen, 0.0)[:, :, None]
+    told = turn.swapaxes(-1, -2) @ (back @ products[:, None, known:, :known])
     size = (left[:, None] * LEVELS) ** 2
-    own = count + 1  # the parameters and the terms
-    square = size[:, None, :, None]
-    value, _, squares = _marginal(
-        whole[:, None, None, :own, :own],
-        told[:, :, None, :, :own],
-        square,
-        eigen[:, :, None],
-        count,
-    )
+    share = size[:, None, :, None] / (1 + size[:, None, :, None] * eigen)
+    squares = products[:, :1, :1] - (share * told[:, :, None, :, 0] ** 2).sum(-1)
+    value = np.log1p(size[:, None, :, None] * eigen).sum(-1) + squares
+    value = np.where(np.isfinite(value) & (squares > 0), value, np.inf)
     best = value.min((1, 2))
-    penalty = value - best[:, None, None]
-    weight = np.exp(-0.5 * penalty)
+    weight = np.exp(-0.5 * (value - best[:, None, None]))
     weight = weight / weight.sum((1, 2), keepdims=True)
     covariance = np.nan_to_num(np.einsum("rkl,rl,kij->rij", weight, size, every))
     # Of each size the likeliest length and power, and no δ at all.
-    row, place = np.arange(len(value))[:, None], value.argmin(1)
-    size, place = np.pad(size, ((0, 0), (1, 0))), np.pad(place, ((0, 0), (1, 0)))
-    of = told[row, place], size[..., None], eigen[row, place]
-    value, scores, left_over = _marginal(whole[:, None], *of, count)
+    row, place, level = np.arange(len(value))[:, None], value.argmin(1), np.arange(LEVELS.size)
+    share, told = share[row, place, level], told[row, place]
+    changed = products[:, None, 0, 1:known] - np.einsum(
+        "rlf,rlfc->rlc", share * told[..., 0], told[..., 1:]
+    )
+    information = diagonal(products)[:, None, 1:known] - np.einsum(
+        "rlf,rlfc->rlc", share, told[..., 1:] ** 2
+    )
+    none = products[:, None, 0, 1:known], diagonal(products)[:, None, 1:known]
+    changed, information = (
+        np.concatenate(of, 1) for of in zip(none, (changed, information), strict=True)
+    )
+    seen = information > NOTHING * whole
+    scores = np.where(seen, changed**2 / np.where(seen, information, 1.0), 0.0)
+    value = np.concatenate([products[:, :1, 0], value.min(1)], 1)
     ratio = (scores - (value - best[:, None])[..., None]).max(1)
-    explained = left_over[:, 0] - squares.reshape(len(best), -1).min(1)
+    explained = products[:, 0, 0] - squares.reshape(len(best), -1).min(1)
     return Restricted(covariance, value[:, 0] - best, ratio, scores[:, 0] / explained[:, None])
 
 
-def _marginal(
-    whole: Float[np.ndarray, "*#row n n"],
-    told: Float[np.ndarray, "*#row function n"],
-    square: Float[np.ndarray, "*#row 1"],
-    eigen: Float[np.ndarray, "*#row function"],
-    count: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """−2 ln p, z² of each change, and the squares of the terms that are left.
-
-    The first `count` rows of the products are those of the parameters, the next that of the terms.
-    """
-    weight = square / (1 + square * eigen)
-    reduced = whole - (told * weight[..., None]).swapaxes(-1, -2) @ told
-    sizes = diagonal(reduced)
-    sound = np.isfinite(sizes).all(-1) & (sizes[..., : count + 1] > 0).all(-1)
-    reduced = np.where(sound[..., None, None], reduced, np.eye(reduced.shape[-1]))
-    scale = np.sqrt(np.maximum(diagonal(reduced), 0.0))
+def _without(
+    products: Float[np.ndarray, "row n n"], count: int
+) -> Float[np.ndarray, "row rest rest"]:
+    """Products of what the first `count` of so many terms leave of the others."""
+    scale = np.sqrt(diagonal(products)[:, :count])
     scale = np.where(scale > 0, scale, 1.0)
-    scaled = reduced / scale[..., :, None] / scale[..., None, :]
-    own = scaled[..., :count, :count] + SMALLEST * np.eye(count)
-    beside = scaled[..., :count, count:]
-    rest = np.linalg.solve(own, beside)
-    size = scale[..., count, None]
-    left = scaled[..., count, count:] - (beside[..., :1] * rest).sum(-2)
-    information = 1.0 - (beside[..., 1:] * rest[..., 1:]).sum(-2)
-    squares = left[..., 0] * size[..., 0] ** 2
-    sign, logdet = np.linalg.slogdet(own)
-    logdet = logdet + np.log1p(square * eigen).sum(-1) + 2 * np.log(scale[..., :count]).sum(-1)
-    logdet = np.where(sound & (sign > 0) & (squares > 0), logdet, np.inf)
-    seen = information > NOTHING
-    z = np.where(seen, (left[..., 1:] * size) ** 2 / np.where(seen, information, 1.0), 0.0)
-    return logdet + squares, z, squares
+    own = products[:, :count, :count] / scale[:, :, None] / scale[:, None, :]
+    beside = products[:, :count, count:] / scale[:, :, None]
+    rest = np.linalg.solve(own + SMALLEST * np.eye(count), beside)
+    return products[:, count:, count:] - beside.swapaxes(-1, -2) @ rest
