@@ -78,7 +78,8 @@ def battery(folder: pathlib.Path) -> etid.Recording:
     kept = np.append(True, (np.asarray(of["data"]["StepTime"])[1:] > 0) & (np.diff(t) > 0))
     at = np.arange(t[kept][0], t[kept][-1], 0.1)
     v_out, current = (np.interp(at, t[kept], one[kept]) for one in (v, 1e-3 * i))
-    return etid.Recording(v_out=v_out, current=current, sample_rate=10.0, pulse_rate=10 / at.size)
+    rates = {"sample_rate": 10.0, "pulse_rate": 10 / at.size}
+    return etid.Recording(v_out=v_out, current=current, hold="zero", **rates)
 
 
 def off(fit: etid.Fit, of: Mapping[str, float]) -> float:
@@ -122,7 +123,9 @@ def main(arguments: argparse.Namespace) -> bool:
         for circuit in (etid.SkinRC(), etid.SkinCole()):
             fit = etid.identify_skin(one, circuit=circuit, throw=False)
             shown(f"{name}, {type(circuit).__name__}", fit)
-    shown("battery (kA)", etid.identify_skin(battery(folder), circuit="R0-p(R1,C1)", throw=False))
+    for circuit in ("R0-p(R1,C1)", "R0-p(R1,CPE1)"):
+        fit = etid.identify_skin(battery(folder), circuit=circuit, throw=False)
+        shown(f"battery (kA), {circuit}", fit)
     for path in sorted((folder / "dummy_circuits_eis").glob("*.z")):
         fit = shown(path.stem, etid.identify_impedance(*etid.read_impedance(path), throw=False))
         of = dict(zip(fit.circuit.names(), SOLDERED[path.stem.split("_")[0]], strict=True))
