@@ -195,4 +195,4 @@ def test_bends_of_the_gain_are_no_noise_of_a_short_record():
     one = etid.Recording(v_out=v_out, current=staircase(command), **rates)
     variance = Inspected.of(one).bins.fields[4]
     assert np.max(variance) < 30 * 1e-8 / at.size  # it was 10 000 times this
-    assert etid.identify_skin(one, throw=False).verdict == "misfit"
+    assert etid.identify_skin(one, throw=False).verdict != "successful"

@@ -92,6 +92,7 @@ class Display:
         begun: How many amplitudes it was sent until it was started again, each time.
         steps: Number of steps from amplitude 0 to 1, which it tells and to which it rounds; 0 if it
             gives any amplitude.
+        half: Whether it closes its half of the connection in place of the next block.
         raw: Bytes to send in place of the next block; none: the connection is closed.
         line: The connection.
     """
@@ -99,7 +100,7 @@ class Display:
     def __init__(self, electrodes, steps=0):
         self.skin, self.given, self.pulses = ["dry"] * electrodes, [], []
         self.silent, self.number, self.steps = False, 0, steps
-        self.again, self.begun = False, []
+        self.again, self.begun, self.half = False, [], False
         self.raw: bytes | None = None
         self.server = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self.server.getsockname()[1]}"
@@ -117,6 +118,10 @@ class Display:
                     now = np.frombuffer(told, "<f8")
                     self.given.append(now)
                     if self.silent or select.select([line], [], [], 0)[0]:
+                        continue
+                    if self.half:
+                        line.shutdown(socket.SHUT_WR)
+                        self.silent = True
                         continue
                     if self.raw is not None:
                         if not self.raw:
@@ -565,8 +570,7 @@ def test_the_command_leaves_0_behind_and_says_so(calibration, how, capsys):
             case "hangs up":
                 display.raw = b""
             case "closes its half":
-                display.silent = True
-                display.line.shutdown(socket.SHUT_WR)
+                display.half = True
 
     ending = threading.Thread(target=end)
     ending.start()
