@@ -78,8 +78,9 @@ def battery(folder: pathlib.Path) -> etid.Recording:
     kept = np.append(True, (np.asarray(of["data"]["StepTime"])[1:] > 0) & (np.diff(t) > 0))
     at = np.arange(t[kept][0], t[kept][-1], 0.1)
     v_out, current = (np.interp(at, t[kept], one[kept]) for one in (v, 1e-3 * i))
-    rates = {"sample_rate": 10.0, "pulse_rate": 10 / at.size}
-    return etid.Recording(v_out=v_out, current=current, hold="zero", **rates)
+    return etid.Recording(
+        v_out=v_out, current=current, sample_rate=10.0, pulse_rate=10 / at.size, hold="zero"
+    )
 
 
 def off(fit: etid.Fit, of: Mapping[str, float]) -> float:

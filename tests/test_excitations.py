@@ -191,8 +191,8 @@ def test_bends_of_the_gain_are_no_noise_of_a_short_record():
     decay = np.exp(-1 / (24e3 * 8e-3))
     of_layer = scipy.signal.lfilter([0, 20e3 * (1 - decay)], [1, -decay], command)
     v_out = 1e3 * command + of_layer + 1e-4 * rng.standard_normal(at.size)
-    rates = {"sample_rate": 24e3, "pulse_rate": 24e3 / 243}
-    one = etid.Recording(v_out=v_out, current=staircase(command), **rates)
+    current = staircase(command)
+    one = etid.Recording(v_out=v_out, current=current, sample_rate=24e3, pulse_rate=24e3 / 243)
     variance = Inspected.of(one).bins.fields[4]
     assert np.max(variance) < 30 * 1e-8 / at.size  # it was 10 000 times this
     assert etid.identify_skin(one, throw=False).verdict != "successful"
