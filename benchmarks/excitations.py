@@ -90,9 +90,8 @@ def recording(
     **fields: Any,
 ) -> etid.Recording:
     """The recording of a cause and of its effect, with noise; all of them, or a part."""
-    part = slice(None) if whole else slice(BEFORE, BEFORE + PERIOD)
     clean = np.stack(both) * (size / both[0].std())
-    clean = np.tile(clean, 3) if whole else clean[:, part]
+    clean = np.tile(clean, 3) if whole else clean[:, BEFORE : BEFORE + PERIOD]
     noisy = clean + clean.std(1)[:, None] / snr * rng.standard_normal(clean.shape)
     if fields.get("hold"):
         noisy[0] = clean[0]

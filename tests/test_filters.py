@@ -91,8 +91,9 @@ def test_both_channels_may_have_one():
 
 
 def test_a_filter_that_is_not_stated_is_seen():
-    rng = np.random.default_rng(3)
-    one = recorded(rng, current=("bessel", 4, 40e3))
+    strong = recorded(np.random.default_rng(3), current=("bessel", 4, 10e3))
+    assert etid.identify_skin(strong, throw=False).verdict != "successful"
+    one = recorded(np.random.default_rng(3), current=("bessel", 4, 40e3))
     fit = etid.identify_skin(one, throw=False)
     assert fit.verdict == "misfit"
     assert "a low-pass of one channel" in fit.note

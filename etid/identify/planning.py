@@ -35,10 +35,7 @@ from etid.results.verdicts import message, verdict
 TOGETHER = 640_000  # samples that are inspected together; their arrays take tens of MB
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 # Verdicts whose message says more of a recording.
-EXPLAINED = (
-    *("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples"),
-    "saturated",
-)
+EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples", "saturated")
 T = TypeVar("T")
 
 Load = Callable[[int], tuple[Recording, AbstractFeed]]

@@ -18,7 +18,7 @@ from etid.likelihood import scores
 from etid.likelihood.discrepancy import POWERS, Discrepancy, kernels, splines
 from etid.likelihood.linear import taken
 from etid.likelihood.noise import SMOOTH, is_smooth
-from etid.likelihood.restricted import ROUNDS, SMALLEST, Restricted, restricted
+from etid.likelihood.restricted import ROUNDS, Restricted, restricted, without
 from etid.likelihood.search import Load, Minimum, Near, minimum, of_load, select
 
 ORDINARY = 2 * POWERS.size + 1  # number of the kernel to begin with
@@ -88,14 +88,10 @@ def departs(load: Load, near: Near) -> Bool[np.ndarray, " row"]:
     load, near = load.of(rows), taken(near, rows)
     terms = near.condensed.part
     made = np.concatenate([_exact_rows(load, near.jacobian), _by_node(load, near)], 1)
-    size = np.sqrt((made**2).sum(-1, keepdims=True))
-    made = np.nan_to_num(made / np.where(size > 0, size, 1.0))
-    products = made @ made.swapaxes(-1, -2) + SMALLEST * np.eye(made.shape[1])
-    by_terms = made @ terms[..., None]
-    explained = (by_terms * np.linalg.solve(products, by_terms)).sum((-2, -1))
-    squares = (terms**2).sum(-1)
-    rough = squares - explained - SMOOTH * (terms != 0).sum(-1)
-    smooth[rows] = rough < ROUGH * squares
+    every = np.concatenate([np.nan_to_num(made), terms[:, None]], 1)
+    left = without(every @ every.swapaxes(-1, -2), made.shape[1])[:, 0, 0]
+    rough = left - SMOOTH * (terms != 0).sum(-1)
+    smooth[rows] = rough < ROUGH * (terms**2).sum(-1)
     return smooth
 
 

@@ -83,7 +83,7 @@ def restricted(
     products[:, own, count] += pull
     products[:, count, own] += pull
     whole = diagonal(products)[:, None, count + 1 : known]
-    products, known = _without(products, count), known - count  # the terms and the changes
+    products, known = without(products, count), known - count  # the terms and the changes
     every, root = kernels(harmonics), np.kron(np.eye(parts), roots(harmonics))
     back = root.swapaxes(-1, -2)
     eigen, turn = np.linalg.eigh(back @ products[:, None, known:, known:] @ root)
@@ -119,7 +119,7 @@ def restricted(
     return Restricted(covariance, value[:, 0] - best, ratio, scores[:, 0] / explained[:, None])
 
 
-def _without(
+def without(
     products: Float[np.ndarray, "row n n"], count: int
 ) -> Float[np.ndarray, "row rest rest"]:
     """Products of what the first `count` of so many terms leave of the others."""
