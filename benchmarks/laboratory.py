@@ -13,7 +13,6 @@ The voltage is at rest there but for the 2 % of the droop that the transformer h
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -27,7 +26,6 @@ from etid.simulation.transformer import (
     Impedance,
     OpenLoad,
     Sampler,
-    SkinLoad,
     TransformerDriver,
     loading,
 )
@@ -35,7 +33,6 @@ from etid.simulation.transformer import (
 SCALE = Scene().scale  # volts at the converter per volt at the terminal
 CORNER = Scene().antialias  # of the usual anti-alias filter, relative to the sample rate
 TAYLOR = 3  # terms of a voltage at jittered times: the next is 1e-4 of a step at half a sample
-ROUNDS = 60  # of a fixed point that gains a factor of 1.5 at least
 
 Volts = Float[np.ndarray, " time"]
 Added = Callable[[Volts, np.random.Generator], Volts]
@@ -295,34 +292,3 @@ def pink(rms: float) -> Added:
 def leaky(load: Impedance, r: float) -> Impedance:
     """A load with a resistor [ohm] across it."""
     return lambda f: load(f) * r / (load(f) + r)
-
-
-@dataclasses.dataclass(frozen=True)
-class Nonlinear:
-    """Terminal voltage with skin whose R_p falls with the voltage v across it.
-
-    R_p(v) = R_p / (1 + k (v / v₀)²), v₀ the peak of v, so that R_p is (1 − fall) R_p there. The
-    current that it takes in excess of v / R_p is a source beside the linear circuit, a fixed point
-    of
-
-        V_p = Z_p (I − I_excess),   I = (V_th + Z_p I_excess) / (Z_th + R_s + Z_p).
-    """
-
-    skin: SkinLoad  # its elements at small voltages
-    fall: float  # part of R_p that is lost at the peak
-
-    def __call__(self, driver: TransformerDriver, sampler: Sampler) -> Complex[np.ndarray, " f"]:
-        """Fourier coefficients [V] of the terminal voltage."""
-        of = self.skin
-        f = np.concatenate([[0.0], sampler.f])
-        z_th, z_p = driver.z_th(f), of.r_p / (1 + 2j * np.pi * f * of.r_p * of.c_p)
-        v_th = sampler.pulse_rate * driver.v_th_spectrum(f)  # 0 at 0 Hz, as of any transformer
-        grid = 2 ** math.ceil(math.log2(2 * f.size))
-        curve = self.fall / (1 - self.fall)
-        excess, total = np.zeros(f.size, complex), z_th + of.r_s + z_p
-        for _ in range(ROUNDS):
-            current = (v_th + z_p * excess) / total
-            v = np.fft.irfft(z_p * (current - excess), grid, norm="forward")
-            more = curve * (v / np.abs(v).max()) ** 2 * v / of.r_p
-            excess = np.fft.rfft(more, norm="forward")[: f.size]
-        return (v_th - z_th * (v_th + z_p * excess) / total)[1:]

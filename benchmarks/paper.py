@@ -176,7 +176,9 @@ def main(arguments: argparse.Namespace) -> bool:
     for laboratory, seed in tqdm(jobs, desc="studies", disable=None):
         study = SOURCES[source](scene_of(laboratory, quick), seed)
         for method in METHODS:
-            groups.setdefault((laboratory, method), []).append(identify(laboratory, study, method))
+            groups.setdefault((laboratory, method), []).append(
+                identify(laboratory, study, truth, method)
+            )
     first, fourth = table_1(groups), table_4(groups, truth)
     for which, rows in (1, first), (4, fourth):
         write_csv(folder / f"table_{which}.csv", [{"source": source, **row} for row in rows])

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 import etid
-from benchmarks.laboratory import CORNER, SCALE, Nonlinear, Output, Record, exponential, noise
+from benchmarks.laboratory import CORNER, SCALE, Output, Record, exponential, noise
 from benchmarks.ladder import ELECTRONICS, LOADS
+from etid.simulation.falling import FallingResistance
 from etid.simulation.published import REFERENCE
 from etid.simulation.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
 
@@ -199,7 +200,12 @@ def nonlinear(fall: float) -> Change:
         skin = LOADS[path]
         return Truth.of(skin, dataclasses.replace(skin, r_p=(1 - fall) * skin.r_p))
 
-    return _other(lambda of: out(voltage=Nonlinear(LOADS[of.path], fall))(of), truth)
+    def change(of: Record) -> Record:
+        skin = LOADS[of.path]
+        load = FallingResistance(skin.r_p, skin.c_p, ResistorLoad(skin.r_s), fall)
+        return out(voltage=lambda driver, sampler: load.voltage(driver, sampler.f))(of)
+
+    return _other(change, truth)
 
 
 def _later(of: Record, by: float, **fields: Any) -> Record:

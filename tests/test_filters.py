@@ -96,7 +96,7 @@ def test_a_filter_that_is_not_stated_is_seen():
     one = recorded(np.random.default_rng(3), current=("bessel", 4, 40e3))
     fit = etid.identify_skin(one, throw=False)
     assert fit.verdict == "misfit"
-    assert "a low-pass of one channel" in fit.note
+    assert "a low-pass of the current" in fit.note
 
 
 @pytest.mark.parametrize("samples", [None, 5200])

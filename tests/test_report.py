@@ -31,14 +31,13 @@ def outcome():
 
     skins = fits(etid.SkinRC, [path for path in truth if "r_s" in truth[path]])
     resistors = fits(etid.Resistor, [path for path in truth if path.startswith("resistors/")])
-    return tables.Outcome("quiet", "output_error", pictures.driver(), skins, resistors)
+    return tables.Outcome("quiet", "output_error", truth, pictures.driver(), skins, resistors)
 
 
 def test_demo_tables_show_the_error_that_was_made(outcome):
-    truth = etid.scenes.paper().truth()
-    assert [row[2] for row in demo.table_1([outcome]).rows] == ["10.00"] * 5
+    assert demo.table_1([outcome]).rows[1][2:] == ("10.00",) * 5
     for condition in ("dry", "damp"):
-        rows = demo.table_fingertips([outcome], truth, condition).rows
+        rows = demo.table_fingertips([outcome], condition).rows
         ours = [row for row in rows if row[0] == "quiet"]
         assert len(ours) == len(rows) - len(ours) == 3
         good = outcome.skins.verdicts[outcome.skins.labels["condition"] == condition]
@@ -47,14 +46,14 @@ def test_demo_tables_show_the_error_that_was_made(outcome):
             assert (row[4], row[5], row[7], row[8], row[9]) == (
                 "10.00", "0.00", "10.00", "10.00", counted,
             )  # fmt: skip
-    built = demo.table_4([outcome], truth).rows[1]
+    built = demo.table_4([outcome]).rows[1]
     assert built[2:] == ("10.00 / 0.00",) * 3 + ("5.00", "12/23")
-    verdicts = demo.table_verdicts([outcome], truth).rows[0]
+    verdicts = demo.table_verdicts([outcome]).rows[0]
     assert verdicts[2:] == ("successful", "72 successful, 71 misfit", *("100 %",) * 3)
 
 
 def test_the_tables_that_the_demo_prints(outcome):
-    shown = "\n\n".join(map(str, demo.sections([outcome], etid.scenes.paper().truth())))
+    shown = "\n\n".join(map(str, demo.sections([outcome])))
     printed.check("demo_tables", shown, fitted=False)
 
 

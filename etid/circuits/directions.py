@@ -127,6 +127,7 @@ class Direction:
             imitate less.
         verdict: What a finding is; empty if nothing is found.
         looks: What the residual looks like.
+        looks_back: What it looks like if ε is positive; empty if the same. For a single change.
         passive: Sign of ε that a passive load can have; 0 for both.
         of_circuit: Whether it makes another circuit.
         of_others: Whether it changes the factors of the outputs beside V_out.
@@ -145,6 +146,7 @@ class Direction:
     moves: float = 0.02
     verdict: str = ""
     looks: tuple[str, ...] = ()
+    looks_back: str = ""
     passive: int = 0
     of_circuit: bool = False
     of_others: bool = False
@@ -367,7 +369,8 @@ DIRECTIONS: Mapping[str, Direction] = {
         "factor",
         _slow,
         verdict="misfit",
-        looks=("a low-pass of one channel (state it as v_out_filter or current_filter)",),
+        looks=("a low-pass of v_out (state it as v_out_filter)",),
+        looks_back="a low-pass of the current (state it as current_filter) or of v_th",
     ),
     # Behind a measured current, amplifiers that show less of their peaks.
     "compressed current": Direction(verdict="misfit"),

@@ -38,6 +38,7 @@ class Outcome:
     Attributes:
         laboratory: Name of the laboratory, a key of `LABORATORIES`.
         method: Name of the estimator.
+        truth: True elements of each recording.
         driver: Identified driver.
         skins: Fits of all loads except the test resistors.
         resistors: Fits of the test resistors. Maximum likelihood fits one resistor.
@@ -46,6 +47,7 @@ class Outcome:
 
     laboratory: str
     method: str
+    truth: Truth
     driver: Driver
     skins: Fits
     resistors: Fits
@@ -56,12 +58,15 @@ class Outcome:
         return self.laboratory, self.method
 
 
-def identify(laboratory: str, study: Study, method: str, *, progress: bool = False) -> Outcome:
+def identify(
+    laboratory: str, study: Study, truth: Truth, method: str, *, progress: bool = False
+) -> Outcome:
     """Driver, test resistors and skins of a study, identified by one method.
 
     Args:
         laboratory: Name of the laboratory.
         study: Recordings of the laboratory.
+        truth: True elements of each of them.
         method: Name of the estimator.
         progress: Whether to show the number of fitted skins.
     """
@@ -72,6 +77,7 @@ def identify(laboratory: str, study: Study, method: str, *, progress: bool = Fal
     return Outcome(
         laboratory,
         method,
+        truth,
         driver,
         identify_skins(skins, driver, method=method, progress=progress),
         identify_skins(resistors, driver, circuit=circuit, method=method),

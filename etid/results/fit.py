@@ -18,7 +18,7 @@ from etid.circuits.directions import ALIKE, DIRECTIONS, FAST, SPREAD, Direction,
 from etid.circuits.display import quality, quantity, rounded, several
 from etid.circuits.overview import Overview, element_rows
 from etid.precision import Module, namespace
-from etid.recordings.remarks import texts, words
+from etid.recordings.remarks import Remark, texts, words
 from etid.results.data import HasSource
 from etid.results.instrument import Effects, largest
 from etid.results.method_options import without_known
@@ -116,8 +116,9 @@ class Support(Module):
         for name in named():
             row, z = DIRECTIONS[name], np.nan_to_num(np.asarray(self.of(name), float))
             # The scores have the sign of −ε.
+            looks = (row.looks_back,) if row.looks_back and z[0] < 0 else row.looks
             z = np.maximum(-row.passive * z, 0.0) if row.passive else np.abs(z)
-            found += [(size, row, looks) for size, looks in zip(z.tolist(), row.looks, strict=True)]
+            found += [(size, row, like) for size, like in zip(z.tolist(), looks, strict=True)]
         circuits = [each for each in found if each[1].of_circuit]
         other, spread = max(circuits, key=operator.itemgetter(0)), circuits[0]
         faults = [each for each in found if not each[1].of_circuit]
@@ -392,6 +393,9 @@ class Fit(Judged, HasSource[Circuit]):
 
         Empty without a test and without χ², as of a spectrum without standard errors.
         """
+        falls = int(self.remarks) & Remark.falls_with_current
+        if falls:
+            return texts(falls)[0]
         looks = "" if self.support is None else self.support.looks_like()
         chi2 = float(self.chi2)
         return looks or (
@@ -453,6 +457,6 @@ class Fit(Judged, HasSource[Circuit]):
         known = self.measured is None or self.measured.stderr is not None  # else there is no chi2
         title += f", {quality(float(self.rrse), float(self.chi2) if known else np.nan)}"
         outside = "" if verdict == "out_of_bounds" else self.outside
-        said = filter(None, [told, *self._reasons, outside, self.unstated])
-        notes = [*said, *texts(int(self.remarks))]
+        said = [told, *self._reasons, outside, self.unstated, *texts(int(self.remarks))]
+        notes = list(dict.fromkeys(filter(None, said)))  # a remark may be the reason
         return Overview(title, rows, notes=notes)

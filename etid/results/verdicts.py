@@ -83,9 +83,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "record. Check the channels, and the contact of the finger or of the resistor."
     )
     inconsistent = (
-        "Recording and calibrations contradict each other: the driver changed in between, r_load "
-        "is wrong, or the load is another circuit. Let etid choose the circuit (auto), or "
-        "calibrate again; beside a driver, check the scale of a current too."
+        "The recording contradicts calibrations or what was stated: the driver changed, r_load, "
+        "the scale of a current, its delay or a filter is wrong, or the load is another circuit. "
+        "Let etid choose the circuit (auto), or calibrate again."
     )
     out_of_bounds = (
         "Recording and bounds contradict each other: without its bounds an element lies more than "

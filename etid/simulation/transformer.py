@@ -114,15 +114,30 @@ class TransformerDriver:
         """
         return self._thevenin(f)[1]
 
+    def branches(
+        self, f: Float[np.ndarray, " f"]
+    ) -> tuple[Complex[np.ndarray, " f"], Complex[np.ndarray, " f"], Complex[np.ndarray, " f"]]:
+        """z_1, z_m and z_2 of the T circuit, referred to the secondary.
+
+        Args:
+            f: Frequencies [Hz].
+
+        Returns:
+            Three impedances [ohm].
+        """
+        s = 2j * np.pi * f
+        n = self.turns
+        z_1 = n**2 * (self.r_primary + s * self.l_primary)
+        z_m = n**2 * s * self.l_magnetising * self.r_core / (s * self.l_magnetising + self.r_core)
+        return z_1, z_m, self.r_secondary + s * self.l_secondary
+
     def _thevenin(
         self, f: Float[np.ndarray, " f"]
     ) -> tuple[Complex[np.ndarray, " f"], Complex[np.ndarray, " f"]]:
         """Gain from the source to the open terminal, and the source impedance there [ohm]."""
         s = 2j * np.pi * f
         n = self.turns
-        z_1 = n**2 * (self.r_primary + s * self.l_primary)
-        z_m = n**2 * s * self.l_magnetising * self.r_core / (s * self.l_magnetising + self.r_core)
-        z_2 = self.r_secondary + s * self.l_secondary
+        z_1, z_m, z_2 = self.branches(f)
         delta = z_1 * z_2 + z_1 * z_m + z_2 * z_m
         # Nodal matrix of p and s in real primary volts: the T circuit and what is connected to it.
         y_pp = (
