@@ -18,7 +18,7 @@ from etid.likelihood import scores
 from etid.likelihood.discrepancy import POWERS, Discrepancy, kernels, splines
 from etid.likelihood.linear import taken
 from etid.likelihood.noise import SMOOTH, is_smooth
-from etid.likelihood.restricted import ROUNDS, Restricted, restricted, without
+from etid.likelihood.restricted import Restricted, restricted, without
 from etid.likelihood.search import Load, Minimum, Near, minimum, of_load, select
 
 ORDINARY = 2 * POWERS.size + 1  # number of the kernel to begin with
@@ -59,20 +59,19 @@ def approximated(load: Load, near: Near, start: Float[np.ndarray, "row q"]) -> A
     harmonics = load.records.x.shape[-1]
     flat = kernels(harmonics)[ORDINARY]
     of = with_delta(load, left[:, None, None] ** 2 * flat)
-    least, explains = minimum(of, extended(of, near.q)[None]), {}
+    least = minimum(of, extended(of, near.q)[None])
     if (far := left > FAR).any():
         other = minimum(of, extended(of, start)[None])
         less = other.near.objective < least.near.objective
         least = select(far & less, other, least)
-    for _ in range(ROUNDS if least.settled.any() else 1):
-        near, changes = least.near, scores.changes(of, least.near)
-        found = _restricted(of, near, changes, left)
-        likely = (found.ratio > LIKELY) & (found.explained > MOST)
-        explained = likely | (found.ratio > SURE)
-        ends = np.cumsum([one.shape[-3] for one in changes.values()])[:-1]
-        explains = dict(zip(changes, np.split(explained, ends, -1), strict=True))
-        before, of = of, with_delta(load, found.covariance)
-        least = minimum(of, _nearest(of, before, near.q)[None])
+    near, changes = least.near, scores.changes(of, least.near)
+    found = _restricted(of, near, changes, left)
+    likely = (found.ratio > LIKELY) & (found.explained > MOST)
+    explained = likely | (found.ratio > SURE)
+    ends = np.cumsum([one.shape[-3] for one in changes.values()])[:-1]
+    explains = dict(zip(changes, np.split(explained, ends, -1), strict=True))
+    before, of = of, with_delta(load, found.covariance)
+    least = minimum(of, _nearest(of, before, near.q)[None])
     return Approximation(of, least, explains)
 
 

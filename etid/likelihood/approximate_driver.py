@@ -25,7 +25,7 @@ from etid.likelihood.discrepancy import root_of, splines
 from etid.likelihood.linear import LevenbergMarquardt
 from etid.likelihood.noise import is_smooth
 from etid.likelihood.of_calibrations import likeliest_section
-from etid.likelihood.restricted import ROUNDS, Restricted, restricted
+from etid.likelihood.restricted import Restricted, restricted
 from etid.likelihood.source_prior import same_load
 from etid.results.driver import LARGEST
 from etid.signals.departure import Departure
@@ -34,6 +34,7 @@ from etid.signals.departure import Departure
 PERHAPS = 0.78
 # Likelihood ratio of δ. Of 60 good drivers at 40 to 80 dB the largest is 8.
 SURE = 25.0
+ROUNDS = 2  # the size of δ is chosen again where its first choice has led
 STEPS = 60  # with one more section; what it explains is seen earlier
 SMALLEST = 1e-3  # size of a function relative to the largest, below which it makes no difference
 

@@ -27,6 +27,7 @@ from etid.signals.transfer import AnyArray
 SPACING = 0.35  # of the nodes; a spline through them is good to 1 % of δ of the shortest length
 LENGTHS = 0.5 * 1.3 ** np.arange(8)  # the nearest is 14 % off
 POWERS = np.array([-0.4, 0.0, 0.4, 0.8])  # a low-pass errs by a power of 1 to 2
+NOTHING = 1e-5  # of the variance of a δ
 FUNCTIONS = 20  # δ of the shortest length leaves 1e-4 of its variance to others
 
 
@@ -61,9 +62,13 @@ def kernels(harmonics: int) -> Float[np.ndarray, "kernel node node"]:
 
 
 @functools.lru_cache(maxsize=16)
-def roots(harmonics: int) -> Float[np.ndarray, "kernel node function"]:
-    """The functions of each kernel."""
-    return root_of(kernels(harmonics))
+def roots(harmonics: int) -> tuple[Float[np.ndarray, "kernel node function"], ...]:
+    """The functions of the kernels of each length, of which longer ones have fewer."""
+    found = []
+    for of in np.split(root_of(kernels(harmonics)), LENGTHS.size):
+        variance = (of**2).sum(-2).max(0)  # the smallest are the first
+        found.append(of[..., np.cumsum(variance) > NOTHING * variance.sum()])
+    return tuple(found)
 
 
 def root_of(covariance: Float[np.ndarray, "*row node node"]) -> AnyArray:

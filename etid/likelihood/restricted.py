@@ -34,7 +34,6 @@ from etid.likelihood.discrepancy import kernels, roots
 from etid.likelihood.linear import diagonal
 
 LEVELS = np.geomspace(0.1, 10.0, 15)  # sizes of δ, relative to what the circuit leaves
-ROUNDS = 2  # in a fit, the size of δ is chosen again where its first choice has led
 SMALLEST = 1e-9  # of a matrix that is scaled to a unit diagonal
 NOTHING = 1e-6  # of the information about a change; the parameters leave less of what they can make
 
@@ -84,11 +83,8 @@ def restricted(
     products[:, count, own] += pull
     whole = diagonal(products)[:, None, count + 1 : known]
     products, known = without(products, count), known - count  # the terms and the changes
-    every, root = kernels(harmonics), np.kron(np.eye(parts), roots(harmonics))
-    back = root.swapaxes(-1, -2)
-    eigen, turn = np.linalg.eigh(back @ products[:, None, known:, known:] @ root)
-    eigen = np.maximum(eigen, 0.0)[:, :, None]
-    told = turn.swapaxes(-1, -2) @ (back @ products[:, None, known:, :known])
+    eigen, told = _independent(products[:, None, known:], known, harmonics, parts)
+    eigen = eigen[:, :, None]
     size = (left[:, None] * LEVELS) ** 2
     share = size[:, None, :, None] / (1 + size[:, None, :, None] * eigen)
     squares = products[:, :1, :1] - (share * told[:, :, None, :, 0] ** 2).sum(-1)
@@ -97,7 +93,7 @@ def restricted(
     best = value.min((1, 2))
     weight = np.exp(-0.5 * (value - best[:, None, None]))
     weight = weight / weight.sum((1, 2), keepdims=True)
-    covariance = np.nan_to_num(np.einsum("rkl,rl,kij->rij", weight, size, every))
+    covariance = np.nan_to_num(np.einsum("rkl,rl,kij->rij", weight, size, kernels(harmonics)))
     # Of each size the likeliest length and power, and no δ at all.
     row, place, level = np.arange(len(value))[:, None], value.argmin(1), np.arange(LEVELS.size)
     share, told = share[row, place, level], told[row, place]
@@ -117,6 +113,28 @@ def restricted(
     ratio = (scores - (value - best[:, None])[..., None]).max(1)
     explained = products[:, 0, 0] - squares.reshape(len(best), -1).min(1)
     return Restricted(covariance, value[:, 0] - best, ratio, scores[:, 0] / explained[:, None])
+
+
+def _independent(
+    products: Float[np.ndarray, "row 1 node every"], known: int, harmonics: int, parts: int
+) -> tuple[
+    Float[np.ndarray, "row kernel function"], Float[np.ndarray, "row kernel function known"]
+]:
+    """Information on the functions of each kernel, turned to be independent; products with them.
+
+    Kernels of long lengths have fewer functions than others; the rest are zeros.
+    """
+    every = [np.kron(np.eye(parts), of) for of in roots(harmonics)]
+    most, found = max(of.shape[-1] for of in every), []
+    for root in every:
+        back = root.swapaxes(-1, -2)
+        eigen, turn = np.linalg.eigh(back @ products[..., known:] @ root)
+        told = turn.swapaxes(-1, -2) @ (back @ products[..., :known])
+        more = (0, most - eigen.shape[-1])
+        eigen = np.pad(np.maximum(eigen, 0.0), [(0, 0), (0, 0), more])
+        found.append((eigen, np.pad(told, [(0, 0), (0, 0), more, (0, 0)])))
+    eigens, tolds = zip(*found, strict=True)
+    return np.concatenate(eigens, 1), np.concatenate(tolds, 1)
 
 
 def without(
