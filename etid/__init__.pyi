@@ -10,6 +10,7 @@ from .circuits.circuit import SkinWarburg as SkinWarburg
 from .circuits.circuit import parameter as parameter
 from .circuits.current_dependent import SkinCurrent as SkinCurrent
 from .circuits.current_dependent import current_dependent_resistor as current_dependent_resistor
+from .circuits.discrete import Filter as Filter
 from .circuits.elements import capacitor as capacitor
 from .circuits.elements import cole as cole
 from .circuits.elements import constant_phase as constant_phase
@@ -24,6 +25,7 @@ from .estimators.estimator import AbstractEstimator as AbstractEstimator
 from .estimators.maximum_likelihood.estimator import MaximumLikelihood as MaximumLikelihood
 from .estimators.output_error import OutputError as OutputError
 from .estimators.registry import register as register
+from .estimators.steiglitz_mcbride.arrays import steiglitz_mcbride as steiglitz_mcbride
 from .estimators.steiglitz_mcbride.estimator import EquationError as EquationError
 from .estimators.steiglitz_mcbride.estimator import SteiglitzMcBride as SteiglitzMcBride
 from .files.exporting import export_circuit as export_circuit
@@ -38,6 +40,7 @@ from .identify.impedance import identify_impedance as identify_impedance
 from .identify.jointly import identify_jointly as identify_jointly
 from .identify.kramers_kronig import KramersKronig as KramersKronig
 from .identify.kramers_kronig import kramers_kronig as kramers_kronig
+from .identify.likelihood import Likelihood as Likelihood
 from .identify.predict import predict as predict
 from .identify.samples import identify_samples as identify_samples
 from .identify.skins import identify_skin as identify_skin

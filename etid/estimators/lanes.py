@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several
-from etid.precision import Module
+from etid.precision import Module, namespace
 from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
@@ -34,7 +34,7 @@ from etid.signals.harmonics import (
 from etid.signals.hold import of_hold
 from etid.signals.lags import rest
 from etid.signals.low_pass import Filters
-from etid.signals.noise import Measurement, floor, noise_of
+from etid.signals.noise import Measurement, Noise, floor, noise_of
 from etid.signals.rounding import rounding_variance
 from etid.signals.transfer import AnyArray, power
 
@@ -190,19 +190,26 @@ class Harmonics(AbstractLane):
         """
         if periods[0] == 0:
             raise ValueError(f"no whole pulse period in {several(m.v_out.shape[0], 'sample')}")
-        both = harmonics(jnp.stack([of[: periods[1]] for of in (m.v_th, m.v_out)]), *periods)
-        records = jnp.stack([m.v_th, m.v_out])
-        least = jnp.stack([m.sigma_th, m.sigma_out])[:, None] ** 2 / periods[1]
-        found = jax.vmap(lambda v: noise_of(v, *periods).variance)(records)
-        noise = jax.lax.stop_gradient(jnp.maximum(found, least))
-        frequency, x, y, of_x, of_y, selected = filled(both, noise, m.sample_rate, *periods)
+        records = m.records
+        both = harmonics(records[..., : periods[1]], *periods)
+        noise = _least(noise_of(records, *periods), m, periods[1])
+        frequency, x, y, of_x, of_y, selected = filled(both, noise, _rate(m), *periods)
         if joins_aliases(*periods):
             # As the noise, they are no data of the fit: derivatives by the records hold them.
             of_x, of_y = (
-                of + jax.lax.stop_gradient(aliases(record, of, *periods).variance)
+                of + constant(aliases(record, of, *periods).variance)
                 for record, of in ((x, of_x), (y, of_y))
             )
-        return cls(frequency, x, y, of_x, of_y, selected, m.sample_rate)
+        return cls._of_rows(m, frequency, x, y, of_x, of_y, selected)
+
+    @classmethod
+    def _of_rows(
+        cls: type[_Harmonics], m: Measurement, frequency: AnyArray, x: AnyArray, *of: AnyArray
+    ) -> _Harmonics:
+        """The lane of these fields; all recordings have one frequency and one selection."""
+        xp, (*rest, selected) = namespace(x), of
+        frequency, selected = (xp.broadcast_to(one, x.shape) for one in (frequency, selected))
+        return cls(frequency, x, *rest, selected, m.sample_rate)
 
     @property
     def fields(self) -> Spectrum:
@@ -269,13 +276,11 @@ class Bins(Harmonics):
     def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "Bins":
         """The bins of bare arrays."""
         del periods
-        records, size = jnp.stack([m.v_th, m.v_out]), m.v_out.shape[0]
-        least = jnp.stack([m.sigma_th, m.sigma_out])[:, None] ** 2 / size
-        found = jax.vmap(lambda v: noise_of(v, 1, size, whole=False).variance)(records)
-        noise = jax.lax.stop_gradient(jnp.maximum(found, least))
+        records, size = m.records, m.v_out.shape[-1]
+        noise = _least(noise_of(records, 1, size, whole=False), m, size)
         count = math.ceil(ALIASED * size)
-        of = harmonics_of(records, 1)[:, :count], noise[:, :count]
-        return cls(*[*filled(*of, m.sample_rate, 1, size), m.sample_rate])
+        of = harmonics_of(records, 1)[..., :count], noise[..., :count]
+        return cls._of_rows(m, *filled(*of, _rate(m), 1, size))
 
     @property
     def shapes(self) -> tuple[Any, ...]:
@@ -401,6 +406,23 @@ class AlignedSamples(AbstractLane):
     def measure(self) -> Measurement:
         """Both records and their noise."""
         return Measurement(self.v_th, self.v_out, self.sigma_th, self.sigma_out, self.sample_rate)
+
+
+def _least(noise: Noise, m: Measurement, samples: int) -> AnyArray:
+    """The noise of the coefficients, at least that of the samples; no data of the fit."""
+    xp = namespace(m.v_out)
+    least = xp.stack([m.sigma_th, m.sigma_out], -1)[..., None] ** 2 / samples
+    return constant(xp.maximum(noise.variance, least))
+
+
+def _rate(m: Measurement) -> Float[AnyArray, ""]:
+    """The sample rate, which is one for all recordings."""
+    return m.sample_rate.reshape(-1)[0]
+
+
+def constant(of: AnyArray) -> AnyArray:
+    """The same without a derivative."""
+    return of if namespace(of) is np else jax.lax.stop_gradient(of)
 
 
 def _gain(

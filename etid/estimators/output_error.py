@@ -54,17 +54,17 @@ class OutputBins(Bins):
         """The bins of bare arrays."""
         *fields, rate = jax.tree.leaves(Bins.of_samples(m, periods))
         sigma = namespace(m.v_out).stack([m.sigma_th, m.sigma_out])
-        return cls(*[*_weighted(fields, sigma, m.v_out.shape[0]), rate])
+        return cls(*[*_weighted(fields, sigma, m.v_out.shape[-1]), rate])
 
 
 def _weighted(
-    fields: Sequence[AnyArray], sigma: Float[AnyArray, "2"], samples: int
+    fields: Sequence[AnyArray], sigma: Float[AnyArray, "2 *lane"], samples: int
 ) -> tuple[AnyArray, ...]:
     """The fields of a `Spectrum`, weighted by this noise of a sample of both records."""
     frequency, x, y, variance_x, variance_y, selected = fields
     xp = namespace(x)
-    of_x, of_y = (xp.where(selected, power(of), 0.0).sum() for of in (x, y))
-    noise = (sigma[1] ** 2 + of_y / of_x * sigma[0] ** 2) / samples
+    of_x, of_y = (xp.where(selected, power(of), 0.0).sum(-1) for of in (x, y))
+    noise = ((sigma[1] ** 2 + of_y / of_x * sigma[0] ** 2) / samples)[..., None]
     return frequency, x, y, 0 * variance_x, noise + 0 * variance_y, selected
 
 

@@ -1,22 +1,21 @@
 """Identification of plain arrays, which JAX can transform."""
 
 import dataclasses
-from typing import cast
+from typing import Any, cast
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
-from etid.estimators.lanes import Harmonics
+from etid.estimators.lanes import AbstractLane, Harmonics, constant
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import require
 from etid.identify.options import Options, candidates_of
-from etid.precision import in_float64, namespace, untraced
+from etid.precision import array_function, in_float64, namespace, untraced
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
+from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.signals.harmonics import harmonics, same_unloaded, whole_periods
 from etid.signals.missing import unmasked
@@ -63,29 +62,49 @@ def identify_samples(
     """
     require("driver", driver, Driver)
     options = Options.of(candidates_of(circuit), method=method)
-    periods = whole_periods(v_out.shape[0], sample_rate, pulse_rate)
     estimator = cast(AbstractEstimator, options.estimator or MAXIMUM_LIKELIHOOD)
     estimator.check_driver(driver, sample_rate)
-    recorded = unmasked(v_th)
-    v_th, v_out, step = (jnp.asarray(unmasked(value), float) for value in (v_th, v_out, resolution))
-    rate = untraced(unmasked(sample_rate))
-    # At harmonics the noise is measured, and its floor is needed only. White noise is a median: by
-    # its derivative, few samples would have most of the weight.
-    kind = estimator.lane_of_periods(periods[0])
-    of = floor if issubclass(kind, Harmonics) else noise
-    of_th, of_out = (jax.lax.stop_gradient(jnp.asarray(of(v, step))) for v in (v_th, v_out))
-    lane = kind.of_samples(Measurement(v_th, v_out, of_th, of_out, rate), periods)
-    known = None
-    if isinstance(lane, Harmonics):
-        shared = kind.periodic and _may_share(recorded, driver, periods)
-        known = estimator.known(*untraced((driver, lane.frequency)), shared)
+    lane, known = given(v_th, v_out, driver, estimator, sample_rate, pulse_rate, resolution)
     fit = estimator.fit_load(lane, driver, known, options.circuit)
     # No harmonic is left out here, so a remark about hum would be untrue.
     remarks = fit.remarks & ~int(Remark.mains_hum)
     return dataclasses.replace(fit, remarks=namespace(remarks).asarray(remarks))
 
 
-def _may_share(recorded: AnyArray, driver: Driver, periods: tuple[int, int]) -> bool:
+@array_function
+def given(
+    v_th: Float[AnyArray, "*row time"],
+    v_out: Float[AnyArray, "*row time"],
+    driver: AbstractFeed,
+    estimator: AbstractEstimator,
+    sample_rate: float,
+    pulse_rate: float,
+    resolution: float,
+) -> tuple[AbstractLane, Any]:
+    """The lane of plain arrays, and what is known of the driver for it.
+
+    Arrays of NumPy if JAX traces none of them. Whole periods are harmonics, other records bins.
+    """
+    v_th, v_out, step, rate = untraced((v_th, v_out, resolution, sample_rate))
+    recorded, xp = unmasked(v_th), namespace(v_th, v_out)
+    v_th, v_out, step = (xp.asarray(unmasked(value), float) for value in (v_th, v_out, step))
+    periods = whole_periods(v_out.shape[-1], sample_rate, pulse_rate)
+    # At harmonics the noise is measured, and its floor is needed only. White noise is a median: by
+    # its derivative, few samples would have most of the weight.
+    kind = estimator.lane_of_periods(periods[0])
+    of = floor if issubclass(kind, Harmonics) else noise
+    of_th, of_out = (constant(xp.asarray(of(v, step))) for v in (v_th, v_out))
+    rates = xp.broadcast_to(unmasked(rate), v_out.shape[:-1])
+    lane = kind.of_samples(Measurement(v_th, v_out, of_th, of_out, rates), periods)
+    known = None
+    if isinstance(lane, Harmonics):
+        shared = kind.periodic and _may_share(recorded, driver, periods)
+        first = lane.frequency.reshape(-1, lane.frequency.shape[-1])[0]
+        known = estimator.known(*untraced((driver, first)), shared)
+    return lane, known
+
+
+def _may_share(recorded: AnyArray, driver: AbstractFeed, periods: tuple[int, int]) -> bool:
     """Whether an unloaded record may be that of a calibration; what JAX traces may be.
 
     Without one that they share, a program and its derivative are a fifth smaller.
@@ -95,5 +114,5 @@ def _may_share(recorded: AnyArray, driver: Driver, periods: tuple[int, int]) -> 
     recorded, known = untraced((recorded, driver.spectra.x))
     if not isinstance(known, np.ndarray):
         return True
-    x = harmonics(recorded.astype(float), *periods)
-    return bool(np.any(same_unloaded(x, known[:, : x.size])))
+    x = harmonics(recorded.astype(float), *periods)[..., None, :]
+    return bool(np.any(same_unloaded(x, known[:, : x.shape[-1]])))

@@ -56,16 +56,18 @@ class StateSpace(Module):
 
 def simulate(
     system: StateSpace,
-    u: Float[AnyArray, "time input"],
-    x0: Float[AnyArray, "*row state"],
+    u: Float[AnyArray, "*input_row time input"],
+    x0: Float[AnyArray, "*state_row state"],
 ) -> tuple[Float[AnyArray, "*row time"], Float[AnyArray, "*row state"]]:
     """Run the discrete recursion x[n+1] = A x[n] + B u[n], y[n] = C x[n] + D u[n].
 
-    All rows of initial states have the same input.
+    Rows of inputs and of initial states are broadcast against each other.
     """
     A, B, C, D = system.A, system.B, system.C, system.D
-    xp, (time, inputs), states = namespace(A, B, C, D, u, x0), u.shape, C.shape[0]
-    x0 = xp.asarray(x0)
+    xp, states = namespace(A, B, C, D, u, x0), C.shape[0]
+    *rows, time, inputs = u.shape
+    every = np.broadcast_shapes(rows, np.shape(x0)[:-1])
+    x0 = xp.broadcast_to(xp.asarray(x0), (*every, states))
     blocks, rest = divmod(time, BLOCK)
 
     powers = xp.eye(states, dtype=A.dtype)[None]  # A^0 … A^BLOCK by doubling
@@ -80,19 +82,19 @@ def simulate(
     toeplitz = xp.take(impulse, np.where(lag >= 0, lag, BLOCK), axis=0, mode="clip")
     reach = xp.einsum("ksr,ri->ksi", powers[::-1], B)  # A^{BLOCK-1-k} B
 
-    whole = u[: blocks * BLOCK].reshape(blocks, BLOCK, inputs)
-    forced = xp.einsum("ijm,bjm->bi", toeplitz, whole)
-    kicks = xp.einsum("jsm,bjm->bs", reach, whole)
-    kicks = kicks.reshape(blocks, *[1] * (x0.ndim - 1), states)
+    whole = u[..., : blocks * BLOCK, :].reshape(*rows, blocks, BLOCK, inputs)
+    forced = xp.einsum("ijm,...bjm->...bi", toeplitz, whole)
+    kicks = xp.moveaxis(xp.einsum("jsm,...bjm->...bs", reach, whole), -2, 0)
+    kicks = kicks.reshape(blocks, *[1] * (len(every) - len(rows)), *rows, states)
 
     starts, x = (_recur if xp is np else _carry)(top, x0, kicks)
     free = xp.moveaxis(starts @ observed.T, 0, -2)
-    y = (forced + free).reshape(*x0.shape[:-1], -1)
+    y = (forced + free).reshape(*every, -1)
     if rest:
-        tail = u[blocks * BLOCK :]
-        y_tail = xp.einsum("ijm,jm->i", toeplitz[:rest, :rest], tail) + x @ observed[:rest].T
+        tail = u[..., blocks * BLOCK :, :]
+        y_tail = xp.einsum("ijm,...jm->...i", toeplitz[:rest, :rest], tail) + x @ observed[:rest].T
         y = xp.concatenate([y, y_tail], -1)
-        x = x @ powers[rest].T + xp.einsum("jsm,jm->s", reach[BLOCK - rest :], tail)
+        x = x @ powers[rest].T + xp.einsum("jsm,...jm->...s", reach[BLOCK - rest :], tail)
     return y, x
 
 
@@ -142,13 +144,13 @@ def _carry_jvp(
     return (states, last), _recur(a, dx0, du + states @ da.T)
 
 
-def companion(b: Float[Array, " b"], a: Float[Array, " a"]) -> StateSpace:
+def companion(b: Float[AnyArray, " b"], a: Float[AnyArray, " a"]) -> StateSpace:
     """Transposed direct form II of B(z⁻¹)/A(z⁻¹); its state is SciPy's `zi`."""
-    order = max(b.shape[0], a.shape[0]) - 1
-    b = jnp.pad(b, (0, order + 1 - b.shape[0])) / a[0]
-    a = jnp.pad(a, (0, order + 1 - a.shape[0])) / a[0]
-    shift = jnp.eye(order, k=1, dtype=a.dtype)
-    first = jnp.eye(1, order, dtype=a.dtype)
+    xp, order = namespace(b, a), max(b.shape[0], a.shape[0]) - 1
+    b = xp.pad(b, (0, order + 1 - b.shape[0])) / a[0]
+    a = xp.pad(a, (0, order + 1 - a.shape[0])) / a[0]
+    shift = xp.eye(order, k=1, dtype=a.dtype)
+    first = xp.eye(1, order, dtype=a.dtype)
     return StateSpace(
         A=shift - a[1:, None] * first,
         B=(b[1:] - a[1:] * b[0])[:, None],

@@ -287,6 +287,11 @@ class Measurement(Module):
     sigma_out: Float[AnyArray, "*lane"]
     sample_rate: Float[AnyArray, "*lane"]
 
+    @property
+    def records(self) -> Float[AnyArray, "*lane 2 time"]:
+        """Both voltages [V]."""
+        return namespace(self.v_th, self.v_out).stack([self.v_th, self.v_out], -2)
+
 
 def floor(
     v: Float[Array | np.ndarray, "*record time"],

@@ -1,0 +1,203 @@
+"""The likelihood of plain arrays, for models and samplers of others.
+
+It is the one that `identify_skin` maximises: gains of the load and of Z_th, the unknown unloaded
+voltage profiled out (`etid.likelihood.profile`). Its parameters q are
+
+    ln of each element,   the trigger delay [samples],   z.
+
+z is what the calibrations leave open of Z_th, in their standard deviations; a priori it is normal.
+"""
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.estimator import serving
+from etid.estimators.lanes import Harmonics, unstacked
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.rows import calibrated, load_of, source_of
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
+from etid.identify.arguments import require
+from etid.identify.options import candidates_of
+from etid.identify.samples import given
+from etid.likelihood.gains import Gains
+from etid.likelihood.search import Load, Near
+from etid.likelihood.starts import starts
+from etid.precision import Module, array_function, in_float64, is_traced, namespace
+from etid.results.driver import ContinuousDriver, Driver
+from etid.results.feed import MEASURED_CURRENT, MeasuredCurrent
+from etid.results.fit import Fit
+from etid.signals.harmonics import real_parts
+from etid.signals.transfer import AnyArray, as_complex
+
+
+class Likelihood(Module):
+    """The likelihood of one recording, or of several with equal rates along leading axes.
+
+    `Likelihood.of` makes it from arrays. All methods are functions of arrays: JAX can trace,
+    differentiate and map them, and with arrays of NumPy nothing is compiled.
+
+    Attributes:
+        lane: Harmonics of the records, or bins of records of any length, with their noise.
+        feed: The driver, or a measured current.
+        known: What the calibrations tell of Z_th at these frequencies.
+        load: All that the likelihood needs.
+    """
+
+    lane: Harmonics
+    feed: ContinuousDriver | MeasuredCurrent
+    known: GivenDriver
+    load: Load
+
+    @classmethod
+    @in_float64
+    @array_function
+    def of(
+        cls,
+        v_th: Float[AnyArray, "*row time"],
+        v_out: Float[AnyArray, "*row time"],
+        driver: Driver | None = None,
+        circuit: AbstractCircuit | str | None = None,
+        *,
+        sample_rate: float,
+        pulse_rate: float,
+        resolution: float = 0.0,
+    ) -> "Likelihood":
+        """The likelihood of bare arrays, whose noise is measured; there is no pre-flight.
+
+        Args:
+            v_th: Unloaded voltage [V], or the current [A] through the load without a driver.
+            v_out: Loaded voltage [V].
+            driver: Identified driver, by maximum likelihood; none if the current was measured.
+            circuit: As in `identify_skin`, without `"auto"`.
+            sample_rate: Samples per second [Hz].
+            pulse_rate: Pulses per second [Hz]. Several whole periods are harmonics, any other
+                records bins.
+            resolution: Step of the converter [V] at the terminal; 0 if not known.
+
+        Raises:
+            ValueError: The driver or the circuit cannot be used.
+        """
+        if driver is None:
+            feed = MEASURED_CURRENT
+        else:
+            require("driver", driver, Driver)
+            feed = serving(driver, ContinuousDriver, str(MAXIMUM_LIKELIHOOD))
+        [structure] = candidates_of(circuit)
+        lane, known = given(
+            v_th, v_out, feed, MAXIMUM_LIKELIHOOD, sample_rate, pulse_rate, resolution
+        )
+        assert isinstance(lane, Harmonics)  # as all lanes of maximum likelihood are
+        load = load_of(lane, source_of(known), structure, None, calibrated(known))
+        return cls(lane, feed, known, load)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters q."""
+        gains = self.load.gains
+        count = self.load.centre.shape[-1] - gains.owned
+        return (*gains.circuit.names(), "delay", *(f"z_{i}" for i in range(count)))
+
+    @in_float64
+    @array_function
+    def start(self) -> Float[AnyArray, "*row q"]:
+        """Parameters to begin with: Steiglitz-McBride on the harmonics, without bias by noise."""
+        return starts(self.load)[0]
+
+    @in_float64
+    @array_function
+    def q(
+        self,
+        circuit: AbstractCircuit,
+        delay: Float[AnyArray, "*row"] | float = 0.0,
+        z: Float[AnyArray, "*row z"] | float = 0.0,
+    ) -> Float[AnyArray, "*row q"]:
+        """The parameters of a circuit.
+
+        Args:
+            circuit: Circuit of the kind of the likelihood.
+            delay: Trigger delay of V_out [s].
+            z: Deviations of Z_th from what the calibrations say [standard deviations].
+
+        Returns:
+            The parameters.
+        """
+        gains, centre = self.load.gains, self.load.centre
+        logs, mean = circuit.log_values(), centre[gains.owned :]
+        xp = namespace(logs, delay, z)
+        late = xp.asarray(delay * gains.sample_rate, float)[..., None]
+        parts = logs, late, mean + xp.asarray(z, float)
+        rows = np.broadcast_shapes(*(of.shape[:-1] for of in parts))
+        return xp.concatenate([xp.broadcast_to(of, (*rows, of.shape[-1])) for of in parts], -1)
+
+    @in_float64
+    @array_function
+    def circuit(self, q: Float[AnyArray, "*row q"]) -> AbstractCircuit:
+        """The circuit of some parameters."""
+        xp, logs = namespace(q), self.load.gains.split(q)[0]
+        return self.load.gains.circuit.of_fit(xp.moveaxis(xp.exp(logs), -1, 0))
+
+    @in_float64
+    @array_function
+    def residual(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row term"]:
+        """Terms r in standard deviations, the priors of delay and z among them.
+
+        −log p = ½ Σ r² + constant. Solvers of least squares minimise it (optimistix, jaxopt).
+        """
+        profile, states = self.load.profile(q, self._at_knots)
+        xp = namespace(q, profile.x)
+        # 2/σ² is 0 where a harmonic is not used; its root has no derivative there.
+        used = profile.weight > 0
+        scale = xp.where(used, xp.sqrt(xp.where(used, profile.weight, 1.0)), 0.0)
+        terms = real_parts(profile.innovations * as_complex(scale))
+        every = [terms.reshape(*terms.shape[:-2], -1), self.load.rest(q)]
+        if states is not None and profile.states is not None:
+            every.append(profile.states / states.width)
+        return xp.concatenate(every, -1)
+
+    @in_float64
+    @array_function
+    def log_prob(
+        self,
+        circuit: AbstractCircuit,
+        delay: Float[AnyArray, "*row"] | float = 0.0,
+        z: Float[AnyArray, "*row z"] | float = 0.0,
+    ) -> Float[AnyArray, "*row"]:
+        """Logarithm of the likelihood and of the priors of delay and z, up to a constant.
+
+        Recordings of one driver share z; add the prior of z once then.
+
+        Args:
+            circuit: As in `q`.
+            delay: As in `q`.
+            z: As in `q`.
+        """
+        return -self.load.objective(self.q(circuit, delay, z))
+
+    @in_float64
+    @array_function
+    def information(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row q q"]:
+        """Fisher information about the parameters, with that of the priors.
+
+        Its inverse is the Cramer-Rao bound of their covariance.
+        """
+        jacobian = Near.of(self.load, self._at_knots, q).jacobian
+        told = np.eye(q.shape[-1]) / self.load.width**2
+        return jacobian @ jacobian.swapaxes(-1, -2) + told
+
+    @in_float64
+    def fit(self) -> Fit:
+        """The fit of `identify_skin`, with elements, covariance and verdict.
+
+        JAX can trace it, map it over recordings, and differentiate elements and delays.
+        """
+        of = self.feed, self.known, self.load.gains.circuit
+        if is_traced(self) or self.lane.x.ndim == 1:
+            return MAXIMUM_LIKELIHOOD.fit_load(self.lane, *of)
+        parts = MAXIMUM_LIKELIHOOD.fit_rows(unstacked(self.lane), *of)
+        return jax.tree.map(lambda *each: np.concatenate(each), *parts)
+
+    @property
+    def _at_knots(self) -> Gains:
+        return self.load.gains.at(self.load.knots.index)
