@@ -49,7 +49,8 @@ def table_of_tests():
     rows = []
     for of in directions.DIRECTIONS.values():
         least = f"ε of {of.least:g}" if of.least else f"{100 * of.moves:g} % of an element"
-        for looks in dict.fromkeys(of.looks) if of.verdict else ():
+        every = filter(None, (*of.looks, of.looks_back))
+        for looks in dict.fromkeys(every) if of.verdict else ():
             rows.append(f"| {looks} | {of.limit:.2g} | {least} | `{of.verdict}` |")
     heads = "| the residual looks like | limit of \\|z\\| | and at least | verdict |"
     return "\n".join([heads, "|---|---|---|---|", *rows])

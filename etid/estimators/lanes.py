@@ -200,16 +200,8 @@ class Harmonics(AbstractLane):
                 of + constant(aliases(record, of, *periods).variance)
                 for record, of in ((x, of_x), (y, of_y))
             )
-        return cls._of_rows(m, frequency, x, y, of_x, of_y, selected)
-
-    @classmethod
-    def _of_rows(
-        cls: type[_Harmonics], m: Measurement, frequency: AnyArray, x: AnyArray, *of: AnyArray
-    ) -> _Harmonics:
-        """The lane of these fields; all recordings have one frequency and one selection."""
-        xp, (*rest, selected) = namespace(x), of
-        frequency, selected = (xp.broadcast_to(one, x.shape) for one in (frequency, selected))
-        return cls(frequency, x, *rest, selected, m.sample_rate)
+        of = _alike(frequency, x, y, of_x, of_y, selected)
+        return cls(*[*of, m.sample_rate])
 
     @property
     def fields(self) -> Spectrum:
@@ -280,7 +272,7 @@ class Bins(Harmonics):
         noise = _least(noise_of(records, 1, size, whole=False), m, size)
         count = math.ceil(ALIASED * size)
         of = harmonics_of(records, 1)[..., :count], noise[..., :count]
-        return cls._of_rows(m, *filled(*of, _rate(m), 1, size))
+        return cls(*[*_alike(*filled(*of, _rate(m), 1, size)), m.sample_rate])
 
     @property
     def shapes(self) -> tuple[Any, ...]:
@@ -413,6 +405,13 @@ def _least(noise: Noise, m: Measurement, samples: int) -> AnyArray:
     xp = namespace(m.v_out)
     least = xp.stack([m.sigma_th, m.sigma_out], -1)[..., None] ** 2 / samples
     return constant(xp.maximum(noise.variance, least))
+
+
+def _alike(frequency: AnyArray, x: AnyArray, *of: AnyArray) -> tuple[AnyArray, ...]:
+    """Fields of a `Spectrum`, of which all recordings have one frequency and one selection."""
+    xp, (*rest, selected) = namespace(x), of
+    frequency, selected = (xp.broadcast_to(one, x.shape) for one in (frequency, selected))
+    return frequency, x, *rest, selected
 
 
 def _rate(m: Measurement) -> Float[AnyArray, ""]:
