@@ -112,6 +112,25 @@ def test_what_has_a_name_is_no_such_error(change):
             assert not one.usable, path
 
 
+@pytest.mark.parametrize(
+    ("skin", "circuit"),
+    [
+        (etid.SkinCole(33e3, 186e3, 22e-6, 0.8), etid.SkinRC()),
+        (etid.SkinCole(6e3, 17e3, 11e-6, 0.8), etid.SkinRC()),
+        (DRY, etid.Resistor()),
+        (etid.SkinRC(6.1e3, 17.4e3, 0.66e-9), etid.Resistor()),
+    ],
+)
+def test_another_circuit_at_little_noise_is_no_such_error(skin, circuit):
+    """What is so large that it is not linear in one number; elements were 30 to 100 ± off."""
+    trials = tuple(etid.scenes.Trial(f"skin/{number}", skin) for number in range(3))
+    calibration = etid.scenes.paper_calibration().calibration
+    study = etid.scenes.Scene(trials, calibration, snr_db=80.0).simulate(seed=4)
+    driver = etid.identify_driver(study[calibration[0].path])
+    fits = etid.identify_skins([study[one.path] for one in trials], driver, circuit=circuit)
+    assert not len(fits.usable())
+
+
 def test_its_profiles_contain_it():
     """Draws would be of all coefficients of δ."""
     fits, *_ = fits_of("δ0.002 1", 41)
