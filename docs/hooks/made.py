@@ -5,6 +5,7 @@ the command line from its parsers, and the reference from the names that `etid` 
 """
 
 import os
+import pathlib
 import re
 import types
 
@@ -16,6 +17,7 @@ from etid.circuits import directions
 from etid.recordings import remarks
 from etid.results import verdicts
 
+ROOT = pathlib.Path(__file__).parents[2]
 MARK = re.compile(r"^<!-- made: (\w+) -->$", re.MULTILINE)
 BORROWED = ("successful", "max_steps_reached", "nonfinite")  # from optimistix, see etid.RESULTS
 
@@ -54,6 +56,23 @@ def table_of_tests():
             rows.append(f"| {looks} | {of.limit:.2g} | {least} | `{of.verdict}` |")
     heads = "| the residual looks like | limit of \\|z\\| | and at least | verdict |"
     return "\n".join([heads, "|---|---|---|---|", *rows])
+
+
+PROGRAMS = (
+    "waveform", "own_circuit", "own_solver", "own_prior", "profile", "hierarchy", "batches",
+    "correct_driver", "pulse", "any_record",
+)  # fmt: skip
+
+
+def programs():
+    """The short programs of `examples`, each under the first line of its docstring."""
+    parts = []
+    for name in PROGRAMS:
+        _, said, code = (ROOT / "examples" / f"{name}.py").read_text("utf-8").split('"""')
+        title, *more = said.strip().split("\n\n")
+        place = f"`python examples/{name}.py`"
+        parts += [f"## {title.rstrip('.')}", *more, place, f"```python\n{code.strip()}\n```"]
+    return "\n\n".join(parts)
 
 
 def commands():
@@ -104,5 +123,6 @@ MADE = {
     "remarks": table_of_remarks,
     "tests": table_of_tests,
     "commands": commands,
+    "programs": programs,
     "reference": reference,
 }

@@ -4,7 +4,7 @@ Whoever gives arrays of JAX, or lets JAX trace, gets arrays of JAX and derivativ
 input and state. Arrays of NumPy are not traced, and nothing is compiled.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Complex, Float
 
@@ -14,6 +14,7 @@ from etid.signals.filtering import StateSpace, companion, simulate
 from etid.signals.transfer import AnyArray, as_complex, delay_variable
 
 
+@runtime_checkable
 class _HasStates(Protocol):
     """An impedance in continuous time."""
 

@@ -93,6 +93,7 @@ def given(
     # its derivative, few samples would have most of the weight.
     kind = estimator.lane_of_periods(periods[0])
     of = floor if issubclass(kind, Harmonics) else noise
+    step = xp.broadcast_to(step, v_out.shape[:-1])
     of_th, of_out = (constant(xp.asarray(of(v, step))) for v in (v_th, v_out))
     rates = xp.broadcast_to(unmasked(rate), v_out.shape[:-1])
     lane = kind.of_samples(Measurement(v_th, v_out, of_th, of_out, rates), periods)

@@ -308,8 +308,10 @@ def floor(
 
 
 def noise(
-    v: Float[Array | np.ndarray, " time"], resolution: Float[Array | np.ndarray, ""]
-) -> Float[Array | np.ndarray, ""]:
-    """White noise of a record, in its unit and at least its `floor`."""
+    v: Float[Array | np.ndarray, "*record time"],
+    resolution: Float[Array | np.ndarray, "*record"],
+) -> Float[Array | np.ndarray, "*record"]:
+    """White noise of records, in their unit and at least their `floor`."""
     xp = namespace(v)
-    return xp.asarray(xp.maximum(noise_std(v), floor(v, resolution)))
+    white = noise_std if xp is np else jnp.vectorize(noise_std, signature="(time)->()")
+    return xp.asarray(xp.maximum(white(v), floor(v, resolution)))

@@ -20,7 +20,7 @@ from etid.signals.transfer import AnyArray, Rational
 @array_function
 def steiglitz_mcbride(
     x: Float[AnyArray, "*record time"],
-    y: Float[AnyArray, "*record time"],
+    y: Float[AnyArray, "..."],
     order: int,
     *,
     zeros: int | None = None,

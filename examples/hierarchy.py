@@ -1,7 +1,6 @@
 """A hierarchy over subjects in NumPyro, who share one driver: z of Z_th is common to all."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import numpyro
 from numpyro.distributions import HalfNormal, Normal

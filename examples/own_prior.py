@@ -28,7 +28,8 @@ q = optx.least_squares(residual, solver, start).value
 slopes = jax.jacfwd(residual)(q, None)
 stderr = jnp.sqrt(jnp.diag(jnp.linalg.inv(slopes.T @ slopes)))[:3]
 alone = likelihood.fit()
-print(
-    f"without: {alone.circuit}, ± {np.round(100 * alone.stderr.values() / alone.circuit.values())} %"
-)
-print(f"with:    {likelihood.circuit(q)}, ± {np.round(100 * stderr)} %")
+for name, one, error in (
+    ("without", alone.circuit, alone.stderr.values() / alone.circuit.values()),
+    ("with", likelihood.circuit(q), stderr),
+):
+    print(f"{name}: {np.array(one.values())}, ± {np.round(100 * np.array(error))} %")

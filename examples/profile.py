@@ -26,4 +26,4 @@ fit = likelihood.fit()
 r_s, error = float(fit.circuit.r_s), float(fit.stderr.r_s)
 for away in (-2.0, -1.0, 0.0, 1.0, 2.0):
     rise = 2 * (profile(np.log(r_s + away * error)) - profile(np.log(r_s)))
-    print(f"{away:+.0f} standard errors: −2 ln L rises by {rise:.2f} (normal: {away**2:.0f})")
+    print(f"{away:+.0f} standard errors: -2 ln L rises by {rise:.2f} (normal: {away**2:.0f})")

@@ -1,0 +1,120 @@
+"""`etid.Likelihood`: the likelihood that a fit maximises, as a function of arrays."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+
+PATHS = "typical/dry/01", "typical/dry/02", "typical/damp/01"
+RATES: dict = {"sample_rate": 200e3, "pulse_rate": 60.0}
+
+
+@pytest.fixture(scope="module")
+def study():
+    return etid.read("data_schema/example.h5")
+
+
+@pytest.fixture(scope="module")
+def driver(study):
+    return etid.identify_driver(study["calibration/98k8"], order=5)
+
+
+def of(driver, *records, first=0, last=None):
+    """The likelihood of recordings, as rows if there are several."""
+    both = [[getattr(one, name)[first:last] for one in records] for name in ("v_th", "v_out")]
+    both = [np.stack(v) if len(v) > 1 else v[0] for v in both]
+    return etid.Likelihood.of(*both, driver, **RATES)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_its_fit_is_that_of_the_recording(study, driver, path):
+    fit, other = of(driver, study[path]).fit(), etid.identify_skin(study[path], driver)
+    assert fit.verdict == other.verdict == "successful"
+    # Both measure the noise of the same periods.
+    np.testing.assert_allclose(fit.circuit.values(), other.circuit.values(), rtol=1e-9)
+    np.testing.assert_allclose(fit.cov, other.cov, rtol=1e-6)
+
+
+@pytest.mark.parametrize("last", [None, 5000])
+def test_rows_are_recordings(study, driver, last):
+    records = [study[path] for path in PATHS]
+    rows = of(driver, *records, last=last)
+    fits = rows.fit()
+    q = rows.start()
+    for row, one in enumerate(records):
+        alone = of(driver, one, last=last)
+        # Starts of rows are sums in another order.
+        np.testing.assert_allclose(rows.residual(q)[row], alone.residual(q[row]), atol=1e-9)
+        np.testing.assert_allclose(
+            fits.circuit.values()[row], alone.fit().circuit.values(), rtol=1e-7
+        )
+    assert rows.log_prob(rows.circuit(q), q[:, 3] / 200e3).shape == (3,)
+
+
+@pytest.mark.parametrize("last", [None, 5000])
+def test_its_terms_are_its_logarithm(study, driver, last):
+    """Of whole periods, and of a record that ends anywhere."""
+    likelihood = of(driver, study[PATHS[0]], last=last)
+    q = likelihood.start()
+    circuit = likelihood.circuit(q)
+    at = likelihood.q(circuit, q[3] / 200e3)
+    squares = 0.5 * np.sum(likelihood.residual(at) ** 2)
+    assert -likelihood.log_prob(circuit, q[3] / 200e3) == pytest.approx(squares, rel=1e-12)
+    assert len(likelihood.names) == q.size
+
+
+def test_its_minimum_is_the_fit(study, driver):
+    likelihood = of(driver, study[PATHS[0]])
+    residual, q = jax.jit(likelihood.residual), jnp.asarray(likelihood.start())
+    for _ in range(4):
+        slopes = jax.jacfwd(residual)(q)
+        q = q - jnp.linalg.solve(slopes.T @ slopes, slopes.T @ residual(q))
+    fit = likelihood.fit()
+    off = (np.array(likelihood.circuit(q).values()) - fit.circuit.values()) / fit.stderr.values()
+    assert np.abs(off).max() < 0.01  # where a search ends, in standard errors
+    bound = np.sqrt(np.diag(np.linalg.inv(likelihood.information(np.asarray(q)))))[:3]
+    # The standard errors of a fit follow the noise that is found, the bound the noise expected.
+    np.testing.assert_allclose(bound, fit.stderr.values() / fit.circuit.values(), rtol=0.1)
+
+
+def test_numpy_and_jax_have_the_same_numbers_and_derivatives(study, driver):
+    likelihood = of(driver, study[PATHS[2]])
+    circuit = likelihood.circuit(likelihood.start())
+    traced = jax.jit(likelihood.log_prob)
+    as_jax = jax.tree.map(jnp.asarray, circuit)
+    assert traced(as_jax, 1e-8) == pytest.approx(likelihood.log_prob(circuit, 1e-8), rel=1e-9)
+    slope = jax.grad(lambda log: likelihood.log_prob(circuit.of_fit(jnp.exp(log)), 1e-8))
+    logs, step = np.asarray(circuit.log_values()), 1e-6
+    numeric = [
+        (likelihood.log_prob(circuit.of_fit(np.exp(logs + step * e)), 1e-8)
+         - likelihood.log_prob(circuit.of_fit(np.exp(logs - step * e)), 1e-8)) / (2 * step)
+        for e in np.eye(3)
+    ]  # fmt: skip
+    np.testing.assert_allclose(slope(jnp.asarray(logs)), numeric, rtol=1e-4, atol=1e-2)
+
+
+def test_fits_of_mapped_arrays(study, driver):
+    both = [jnp.stack([getattr(study[path], name) for path in PATHS]) for name in ("v_th", "v_out")]
+    fits = jax.jit(jax.vmap(lambda *v: etid.Likelihood.of(*v, driver, **RATES).fit()))(*both)
+    rows = of(driver, *[study[path] for path in PATHS]).fit()
+    off = (np.asarray(fits.circuit.values()) - rows.circuit.values()) / rows.stderr.values()
+    assert np.abs(off).max() < 0.01
+
+
+def test_a_measured_current_needs_no_driver(study, driver):
+    """A record of the current through the load, of another simulator than the test of the fit."""
+    scene = etid.scenes.paper_dry(snr_db=60.0, current_snr_db=60.0)
+    one = scene.simulate(seed=0)["typical/dry/01"]
+    likelihood = etid.Likelihood.of(one.current, one.v_out, **RATES)
+    assert likelihood.names == ("r_s", "r_p", "c_p", "delay")
+    fit, other = likelihood.fit(), etid.identify_skin(one.without_v_th())
+    np.testing.assert_allclose(fit.circuit.values(), other.circuit.values(), rtol=1e-6)
+
+
+def test_refusals(study):
+    one = study[PATHS[0]]
+    old = etid.identify_driver(study["calibration/98k8"], method="steiglitz_mcbride", throw=False)
+    with pytest.raises(ValueError, match="maximum_likelihood"):
+        etid.Likelihood.of(one.v_th, one.v_out, old, **RATES)
