@@ -68,7 +68,7 @@ def programs():
     """The short programs of `examples`, each under the first line of its docstring."""
     parts = []
     for name in PROGRAMS:
-        _, said, code = (ROOT / "examples" / f"{name}.py").read_text("utf-8").split('"""')
+        _, said, code = (ROOT / "examples" / f"{name}.py").read_text("utf-8").split('"""', 2)
         title, *more = said.strip().split("\n\n")
         place = f"`python examples/{name}.py`"
         parts += [f"## {title.rstrip('.')}", *more, place, f"```python\n{code.strip()}\n```"]
