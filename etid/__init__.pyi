@@ -41,6 +41,7 @@ from .identify.jointly import identify_jointly as identify_jointly
 from .identify.kramers_kronig import KramersKronig as KramersKronig
 from .identify.kramers_kronig import kramers_kronig as kramers_kronig
 from .identify.likelihood import Likelihood as Likelihood
+from .identify.measured_driver import driver_of_response as driver_of_response
 from .identify.predict import predict as predict
 from .identify.samples import identify_samples as identify_samples
 from .identify.skins import identify_skin as identify_skin

@@ -1,5 +1,7 @@
 """Discrete filters as objects, and Steiglitz-McBride on arrays."""
 
+from typing import Any, cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,7 +50,8 @@ def test_coefficients_and_response(order):
     of = etid.Filter.of(b, a, RATE)
     np.testing.assert_allclose(of.b, b, atol=1e-12)
     np.testing.assert_allclose(of.a, a, atol=1e-12)
-    expected = scipy.signal.freqz(b, a, F, fs=RATE)[1]
+    how: Any = {"worN": F, "fs": RATE}
+    expected = scipy.signal.freqz(b, cast(Any, a), **how)[1]
     np.testing.assert_allclose(of.response(F), expected, atol=1e-11 * np.abs(expected).max())
 
 
@@ -56,7 +59,7 @@ def test_a_circuit_under_the_bilinear_map():
     """The paper's eq. 7, from which eqs. 10 to 12 find the elements again."""
     r_s, r_p, c_p = SKIN.values()
     tau = r_p * c_p
-    b, a = scipy.signal.bilinear([r_s * tau, r_s + r_p], [tau, 1.0], RATE)
+    b, a = map(np.asarray, scipy.signal.bilinear([r_s * tau, r_s + r_p], [tau, 1.0], RATE))
     of = etid.Filter.bilinear(SKIN, RATE)
     np.testing.assert_allclose(of.b, b, rtol=1e-12)
     np.testing.assert_allclose(of.a, a, rtol=1e-12)

@@ -97,7 +97,8 @@ def test_numpy_and_jax_have_the_same_numbers_and_derivatives(study, driver):
 
 def test_fits_of_mapped_arrays(study, driver):
     both = [jnp.stack([getattr(study[path], name) for path in PATHS]) for name in ("v_th", "v_out")]
-    fits = jax.jit(jax.vmap(lambda *v: etid.Likelihood.of(*v, driver, **RATES).fit()))(*both)
+    fit = lambda v_th, v_out: etid.Likelihood.of(v_th, v_out, driver, **RATES).fit()  # noqa: E731
+    fits = jax.jit(jax.vmap(fit))(*both)
     rows = of(driver, *[study[path] for path in PATHS]).fit()
     off = (np.asarray(fits.circuit.values()) - rows.circuit.values()) / rows.stderr.values()
     assert np.abs(off).max() < 0.01
