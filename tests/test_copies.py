@@ -90,6 +90,10 @@ def objects():
         tracker.start(),
         etid.Controller.of(tracker),
         etid.Instrument(gain=0.01),
+        etid.Filter.of(np.array([1.0]), np.array([1.0, -0.5])),
+        etid.Likelihood.of(
+            recording.v_th, recording.v_out, driver, sample_rate=200e3, pulse_rate=60.0
+        ),
         etid.Layout(("1",), np.zeros(1), np.zeros(1)),
         etid.RESULTS.successful,
         etid.RecordingError("is wrong", file="a.h5", field="v_th"),

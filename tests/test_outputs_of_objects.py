@@ -98,6 +98,16 @@ OUTPUTS = {
         "tracker.changes(after)",
         "controller.command(after, charge=80e-9)",
     ]),
+    "arrays": (False, [
+        "etid.Filter.of(np.array([0.5, 0.3]), np.array([1.0, -1.5, 0.7]))",
+        "etid.Filter.of(np.array([0.5]), np.array([1.0, -1.5]), 2e5)",
+        "etid.Filter.bilinear(etid.SkinRC(33.4e3, 186e3, 0.12e-9), 200e3)",
+        "likelihood",
+        "etid.driver_of_response(frequency, z, sample_rate=2e5, order=1)",
+        "etid.driver_of_response(frequency, z[:-1], sample_rate=2e5)",
+        "etid.driver_of_response(frequency[:3], z[:3], sample_rate=2e5)",
+        "etid.steiglitz_mcbride(quiet, quiet[:-1], 2)",
+    ]),
     "estimators": (False, [
         "etid.MaximumLikelihood()",
         "etid.OutputError()",
@@ -176,6 +186,9 @@ def names():
         "fit": etid.identify_skin(recording, driver),
         "misfit": etid.identify_skin(
             recording.replace(v_out=0.9 * recording.v_out), driver, throw=False
+        ),
+        "likelihood": etid.Likelihood.of(
+            recording.v_th, recording.v_out, driver, sample_rate=200e3, pulse_rate=60.0
         ),
         "fits": by_hand.fits,
         "study_fits": by_hand,

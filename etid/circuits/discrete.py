@@ -6,9 +6,12 @@ input and state. Arrays of NumPy are not traced, and nothing is compiled.
 
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import rounded, significant
+from etid.circuits.overview import Overview, Overviewed
 from etid.precision import Module, array_function, in_float64, is_traced, namespace
 from etid.signals.filtering import StateSpace, companion, simulate
 from etid.signals.transfer import AnyArray, as_complex, delay_variable
@@ -21,7 +24,7 @@ class _HasStates(Protocol):
     def state_space(self) -> StateSpace: ...
 
 
-class Filter(Module):
+class Filter(Overviewed, Module):
     """A discrete-time filter with one input and one output.
 
         x[n+1] = A x[n] + B u[n],      y[n] = C x[n] + D u[n]
@@ -112,6 +115,18 @@ class Filter(Module):
     def a(self) -> Float[AnyArray, " order1"]:
         """Denominator in powers of z⁻¹; its first coefficient is 1."""
         return self._polynomials()[1]
+
+    def _overview(self) -> Overview:
+        b, a = self._polynomials()
+        size = np.sort(np.abs(np.linalg.eigvals(self.A)))[::-1]
+        rows = [
+            (name, "  ".join(significant(float(value), 6) for value in of))
+            for name, of in (("b", b), ("a", a), ("size of the poles", size))
+        ]
+        rate = float(self.sample_rate)
+        at = "" if rate == 1 else f" at {rounded(rate / 1e3, 6)} kHz"
+        stable = "" if (size < 1).all() else ", not stable"
+        return Overview(f"Filter of order {len(size)}{at}{stable}", rows)
 
     @in_float64
     @array_function

@@ -120,9 +120,11 @@ class Harmonics(AbstractLane):
         sample_rate: Sampling rate [Hz].
         filters: The known filters of V_out and of the current that causes it; None without any.
             Both records have passed both.
+        exact_input: Whether the weights leave out the noise of X.
     """
 
     periodic = True
+    exact_input: ClassVar[bool] = False
 
     frequency: Float[Array | np.ndarray, "*lane harmonic"]
     x: Complex[Array | np.ndarray, "*lane harmonic"]

@@ -35,7 +35,9 @@ from etid.signals.transfer import AnyArray, power
 
 
 class OutputBins(Bins):
-    """The bins of a record whose input is exact, and whose noise is white."""
+    """The bins of a record whose input is taken for exact, and whose noise is white."""
+
+    exact_input = True
 
     @staticmethod
     def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
@@ -65,7 +67,7 @@ def _weighted(
     xp = namespace(x)
     of_x, of_y = (xp.where(selected, power(of), 0.0).sum(-1) for of in (x, y))
     noise = ((sigma[1] ** 2 + of_y / of_x * sigma[0] ** 2) / samples)[..., None]
-    return frequency, x, y, 0 * variance_x, noise + 0 * variance_y, selected
+    return frequency, x, y, variance_x, noise + 0 * variance_y, selected
 
 
 @dataclasses.dataclass(frozen=True)

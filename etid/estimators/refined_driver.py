@@ -31,6 +31,7 @@ from etid.signals.transfer import AnyArray, Rational, power
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.001, 1.0, 400)  # of the highest bin in use; the source must be passive there
+BIASED = 25.0  # at 40 dB it is 15, which moves a skin by half a standard error; at 30 dB 110
 UNWANTED = 1e3  # added to the cost of a start that did not converge; larger than any cost
 # Two sections closer than `SPLIT` in ln ω and ln ζ are one section, split by noise. Their gains
 # grow with opposite signs along a curved valley, so the curvature at one point is not informative.
@@ -119,6 +120,10 @@ def from_harmonics(
     rrse is that of a Z_th with a smooth error (`etid.likelihood.approximate_driver`).
     """
     spectrum, r_load = jax.tree.map(np.asarray, (records.fields, r_load))
+    ignored = None
+    if records.exact_input:
+        ignored = spectrum.variance_x
+        spectrum = dataclasses.replace(spectrum, variance_x=0 * ignored)
     rate = np.asarray(records.sample_rate)[0]
     bands = banded(spectrum)
     spectra = above_noise(spectrum, bands)
@@ -161,6 +166,7 @@ def from_harmonics(
         result=first_verdict(
             *faults,
             (too_low, RESULTS.order_too_low),
+            (_is_biased(model, near, linear, ignored), RESULTS.biased),
             (np.bool_(inexact and rest > MISFIT_RRSE), RESULTS.approximate),
         ),
         method=method,
@@ -168,6 +174,24 @@ def from_harmonics(
         instrument=instrument,
         missing_pole=statistic,
     )
+
+
+def _is_biased(
+    model: Calibrations,
+    near: Near,
+    linear: Linear,
+    ignored: Float[np.ndarray, "record bin"] | None,
+) -> np.bool_:
+    """Whether noise of X that the weights leave out has moved the minimum (`etid.likelihood.fit`).
+
+    `BIASED` is the square of the move in standard errors of all parameters.
+    """
+    if ignored is None:
+        return np.bool_(False)
+    s, slopes = model.spectra, near.slopes
+    weight = model.knots.summed(np.where(s.selected, 2 * ignored / s.variance_y, 0.0))
+    gradient = (weight * (np.conj(slopes.gains) * slopes.by_q).real).sum((-2, -1))
+    return gradient @ linear.bread() @ gradient > BIASED
 
 
 @array_function

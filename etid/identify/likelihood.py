@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import several, significant
+from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics, unstacked
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
@@ -32,7 +34,7 @@ from etid.signals.harmonics import real_parts
 from etid.signals.transfer import AnyArray, as_complex
 
 
-class Likelihood(Module):
+class Likelihood(Overviewed, Module):
     """The likelihood of one recording, or of several with equal rates along leading axes.
 
     `Likelihood.of` makes it from arrays. All methods are functions of arrays: JAX can trace,
@@ -98,6 +100,21 @@ class Likelihood(Module):
         gains = self.load.gains
         count = self.load.centre.shape[-1] - gains.owned
         return (*gains.circuit.names(), "delay", *(f"z_{i}" for i in range(count)))
+
+    def _overview(self) -> Overview:
+        lane, kind = self.lane, type(self.load.gains.circuit).__name__
+        feed = (
+            f"a driver of order {self.feed.order}" if isinstance(self.feed, Driver) else "a current"
+        )
+        frequency, selected = (
+            np.reshape(of, (-1, of.shape[-1]))[0] for of in (lane.frequency, lane.selected)
+        )
+        used = frequency[selected]
+        count = several(int(np.prod(lane.x.shape[:-1])), "recording")
+        what = "harmonic" if lane.periodic else "bin"
+        band = f"{several(used.size, what)} up to {significant(float(used.max()) / 1e3, 3)} kHz"
+        said = f"Parameters: {', '.join(self.names)}."
+        return Overview(f"Likelihood of {kind} fed by {feed}: {count}, {band}", notes=[said])
 
     @in_float64
     @array_function

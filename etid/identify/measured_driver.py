@@ -17,6 +17,7 @@ import scipy.optimize
 from jaxtyping import Complex, Float
 
 from etid.circuits.discrete import Filter
+from etid.circuits.display import several
 from etid.identify.arguments import LARGEST_ORDER, number_of
 from etid.likelihood.noise import misses
 from etid.precision import array_function, in_float64
@@ -127,7 +128,7 @@ def _check(
         raise RecordingError(f"is {order}, must be 1 to {LARGEST_ORDER}", field="order")
     if 2 * f.size <= 2 * order + 1:
         raise RecordingError(
-            f"has {f.size} values for {2 * order + 1} parameters",
+            f"has {several(f.size, 'value')} for {2 * order + 1} parameters",
             field="z_th",
             remedy="Give more frequencies, or a lower order",
         )

@@ -25,6 +25,7 @@ from etid.signals.transfer import AnyArray, as_complex, power
 
 NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
 SHARE = 0.5  # of the excess of χ², which a change explains that is not smooth if it is the cause
+BIASED = 2.0  # standard errors; a mean error of as many leaves half of the intervals right
 UNSURE = 4.0  # standard deviations of χ² that are no excess
 # Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
 # 200 fits were wrong by five standard errors; both exceed it.
@@ -54,6 +55,7 @@ class Estimate(NamedTuple):
             falls with its current.
         inconsistent: Whether a delay, or the scale of an output such as a current, contradicts the
             driver.
+        biased: Whether noise of X that the weights leave out has moved an element far.
         support: How well the data support the circuit.
         effects: What errors of the instrument do to the elements.
         approximate: Whether `cov` contains what the circuit leaves, which the noise does not
@@ -77,6 +79,7 @@ class Estimate(NamedTuple):
     far: Bool[AnyArray, "*row"]
     other: Bool[AnyArray, "*row"]
     inconsistent: Bool[AnyArray, "*row"]
+    biased: Bool[AnyArray, "*row"]
     support: Support
     effects: Effects
     approximate: Bool[AnyArray, "*row"]
@@ -287,6 +290,7 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
         far=xp.sqrt(moved) > FAR,
         other=other,
         inconsistent=contradicts,
+        biased=_is_biased(load, near, bread, variance),
         support=support,
         effects=dataclasses.replace(
             _effects(source.errors, bread, direct, e, owned),
@@ -295,6 +299,27 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
         approximate=xp.zeros(squares.shape, bool),
         tested=each,
     )
+
+
+def _is_biased(
+    load: Load,
+    near: Near,
+    bread: Float[AnyArray, "*row q q"],
+    variance: Float[AnyArray, "*row element"],
+) -> Bool[AnyArray, "*row"]:
+    """Whether noise of X that the weights leave out has moved an element by `BIASED` errors.
+
+    With X + n in place of X, the expected ½ Σ r² is larger by ½ Σ w |G|² E|n|², w = 2/σ². Its
+    gradient moves the minimum.
+    """
+    xp, slopes = namespace(near.q), near.slopes
+    if load.ignored is None:
+        return xp.zeros(near.q.shape[:-1], bool)
+    weight = load.knots.summed(near.profile.weight * load.ignored[..., None, :])
+    slope = (xp.conj(slopes.gains)[..., None, :, :] * slopes.by_q).real
+    gradient = (weight[..., None, :, :] * slope).sum((-2, -1))
+    moved = (bread @ gradient[..., None])[..., : load.gains.elements, 0]
+    return (xp.abs(moved) > BIASED * xp.sqrt(variance)).any(-1)
 
 
 def _block(own: Float[AnyArray, " own"], of_source: Float[AnyArray, "z z"]) -> AnyArray:

@@ -73,6 +73,7 @@ class Load:
         density: Of the knots (`etid.signals.knots.knots`).
         transient: What the states at the ends of the records are made of; None if the recordings
             are of whole periods.
+        ignored: E|noise|² of X that the weights leave out; None if they do not.
     """
 
     gains: Gains
@@ -82,6 +83,7 @@ class Load:
     unloaded: Unloaded | None = None
     density: int = dataclasses.field(default=DENSITY, metadata={"static": True})
     transient: Transient | None = None
+    ignored: Float[AnyArray, "*row bin"] | None = None
 
     @property
     def knots(self) -> Knots:
@@ -93,8 +95,9 @@ class Load:
         unloaded = self.unloaded and self.unloaded.of(rows)
         gains, records = self.gains.of(rows), self.records.of(rows)
         transient = self.transient and self.transient.of(rows)
+        ignored = None if self.ignored is None else self.ignored[rows]
         of = {"gains": gains, "records": records, "unloaded": unloaded, "transient": transient}
-        return dataclasses.replace(self, **of)
+        return dataclasses.replace(self, **of, ignored=ignored)
 
     @property
     def has_current(self) -> bool:

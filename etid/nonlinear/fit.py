@@ -73,6 +73,7 @@ def _estimate(of: Amplitudes, state: State) -> tuple[Estimate, bool]:
         far=none,
         other=none,
         inconsistent=none,
+        biased=none,
         support=Support.unknown(kept, 1),
         effects=Effects.unknown(kept, 1),
         approximate=none,

@@ -74,7 +74,10 @@ def load_of(
         y = xp.stack([lane.y, lane.i], -2)
         variance_y = xp.stack([lane.variance_y, lane.variance_i], -2)
         used = xp.stack([lane.selected, lane.selected], -2)
-    records = Records(lane.frequency, lane.x, lane.variance_x, y, variance_y, used)
+    of_x, ignored = lane.variance_x, None
+    if lane.exact_input:
+        of_x, ignored = 0 * of_x, of_x
+    records = Records(lane.frequency, lane.x, of_x, y, variance_y, used)
     unloaded = None
     if shared is not None and shared.x.shape[-1] == records.x.shape[-1]:
         same = same_unloaded(records.x[..., None, :], shared.x)
@@ -84,6 +87,7 @@ def load_of(
     if isinstance(lane, Held):
         gains = held(gains, lane.x.shape[:-1])
     load = load_with(gains, records, prior, unloaded)
+    load = dataclasses.replace(load, ignored=ignored)
     if not isinstance(lane, Bins):
         return load
     assert source.decays is not None

@@ -91,6 +91,7 @@ def judged(
         (found.inconsistent | changed, "inconsistent"),
         (found.far, "driver_unclear"),
         (found.other, "misfit"),
+        (found.biased, "biased"),
         (found.approximate & (rest > MISFIT_RRSE), "approximate"),
     )
     remarks = (

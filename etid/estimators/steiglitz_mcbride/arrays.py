@@ -3,6 +3,7 @@
 from jaxtyping import Float
 
 from etid.circuits.discrete import Filter
+from etid.circuits.display import several
 from etid.estimators.steiglitz_mcbride.iteration import (
     ITERATIONS,
     check_iterations,
@@ -59,8 +60,8 @@ def steiglitz_mcbride(
         raise ValueError(f"order is {order} and zeros {zeros}; a filter has a pole at least")
     if x.size < order + zeros + 1:
         raise ValueError(
-            f"x and y have {x.size} samples for {order + zeros + 1} coefficients; record more, or "
-            "lower the order"
+            f"x and y have {several(x.size, 'sample')} for {order + zeros + 1} coefficients; "
+            "record more, or lower the order"
         )
     check_iterations(iterations)
     x, y = (of.reshape(-1, of.shape[-1]) for of in (x, y))

@@ -178,6 +178,7 @@ def _estimated(of: Calibrations, common: Common, one: _Fitted) -> Estimate:
         # A load that takes no part has its own verdict.
         other=misfit & loads.used,
         inconsistent=wrong | ((inconsistent | late) & loads.used),
+        biased=every == 0,
         support=dataclasses.replace(support, z=scores.relevant(tests)),
         effects=Effects.unknown(e, loads.count),
         approximate=every == 0,
