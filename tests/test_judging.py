@@ -20,7 +20,7 @@ from etid.results.instrument import Effects
 from etid.results.verdicts import verdict
 
 NO, YES = np.asarray(False), np.asarray(True)
-FLAGS = "hum", "falls", "doubtful", "far", "other", "inconsistent", "approximate"
+FLAGS = "hum", "falls", "doubtful", "far", "other", "inconsistent", "biased", "approximate"
 
 
 def estimate(
@@ -96,6 +96,7 @@ def test_a_misfit_exceeds_the_noise_in_standard_deviations_and_in_volts(chi2, er
         ({"other": YES}, "misfit"),
         ({"far": YES}, "driver_unclear"),
         ({"inconsistent": YES}, "inconsistent"),
+        ({"biased": YES}, "biased"),
         ({"approximate": YES, "chi2": 9.0, "rrse": 0.015}, "approximate"),
         ({"approximate": YES, "chi2": 9.0, "rrse": 0.025}, "misfit"),
         ({"approximate": YES, "chi2": 9.0, "rrse": 9e-4}, "successful"),
