@@ -31,8 +31,8 @@ from etid.solvers.matrices import inverse
 
 METHOD = "impedance"
 KNOWN = 1e-3  # relative rms error up to which poles explain an impedance that is known
-EXACT = 1e-12  # the same of an impedance that is known
 SETTLED = 1e-4  # of ½ χ², below which a step changes nothing that the standard errors show
+EXACT = 1e-12  # the same where the impedance is known
 STEPS = 1000  # evaluations from each start
 PLACES = (0.03, 0.1, 0.3)  # of a resonance in the starts, relative to the highest frequency
 
@@ -50,8 +50,8 @@ def driver_of_response(
     """A driver from its source impedance at some frequencies.
 
     Args:
-        frequency: Frequencies [Hz], over the band of the pulses: outside of it nothing tells of
-            Z_th.
+        frequency: Frequencies [Hz] from the pulse rate to half the sample rate. Beyond them Z_th is
+            that of the poles, and its standard errors are too small.
         z_th: Source impedance [ohm] at these.
         sample_rate: Rate of the recordings to identify [Hz].
         stderr: Relative standard error of |Z_th|, and of its phase [rad], at each frequency. 0 for
@@ -107,8 +107,8 @@ def _check(
     order: int,
 ) -> None:
     """Raise RecordingError if no driver can be found from these."""
-    for name, of in (("z_th", z_th), ("stderr", stderr)):
-        if f.ndim != 1 or of.shape not in ((), f.shape)[name == "z_th" :]:
+    for name, of, shapes in (("z_th", z_th, [f.shape]), ("stderr", stderr, [f.shape, ()])):
+        if f.ndim != 1 or of.shape not in shapes:
             raise RecordingError(
                 f"has the shape {of.shape}, frequency {f.shape}",
                 field=name,
