@@ -89,11 +89,22 @@ def test_calibrations_and_studies_of_masked_arrays_have_missing_samples(study, r
         assert np.isfinite(made["loaded/0"].v_out).all()
 
 
-@pytest.mark.slow  # it compiles the whole fit
 def test_plain_arrays_with_a_mask_have_the_fit_of_nan(recording, driver):
     of = {"driver": driver, **RATES, "method": "maximum_likelihood"}
     hidden = np.ma.masked_array(recording.v_out, mask=np.arange(recording.v_out.size) == 500)
     assert etid.identify_samples(recording.v_th, hidden, **of).verdict != "successful"
+    del of["method"]
+    fit = etid.Likelihood.of(recording.v_th, hidden, of.pop("driver"), **of).fit()
+    assert fit.verdict != "successful"
+
+
+def test_masked_inputs_of_filters_and_drivers_are_no_numbers():
+    u = masked(np.random.default_rng(0).normal(size=40), at=(5,), value=0.0)
+    filtered = etid.Filter.of(np.array([1.0]), np.array([1.0, -0.5])).simulate(u)[0]
+    assert np.isnan(filtered[5:]).all()
+    assert np.isnan(etid.steiglitz_mcbride(u, u, 1).a).any()
+    with pytest.raises(etid.RecordingError, match="z_th"):
+        etid.driver_of_response(F, masked(Z, at=(5,), value=1e6), sample_rate=2e5)
 
 
 def test_a_masked_impedance_or_error_is_refused():

@@ -14,6 +14,7 @@ from etid.circuits.display import rounded, significant
 from etid.circuits.overview import Overview, Overviewed
 from etid.precision import Module, array_function, in_float64, is_traced, namespace
 from etid.signals.filtering import StateSpace, companion, simulate
+from etid.signals.missing import unmasked
 from etid.signals.transfer import AnyArray, as_complex, delay_variable
 
 
@@ -184,7 +185,7 @@ class Filter(Overviewed, Module):
             The output, of the shape of `u`, and the last state.
         """
         xp = namespace(self.A, self.B, self.C, self.D, u, x0 if x0 is not None else 0.0)
-        u = xp.asarray(u, float)
+        u = xp.asarray(unmasked(u), float)
         states = self.C.shape[0]
         if states == 0:
             return self.D * u, xp.zeros((*u.shape[:-1], 0))

@@ -27,6 +27,7 @@ from etid.results.feed import SourceImpedance
 from etid.results.fit import complex_rrse
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import real_parts
+from etid.signals.missing import unmasked
 from etid.solvers.matrices import inverse
 
 METHOD = "impedance"
@@ -65,8 +66,8 @@ def driver_of_response(
     Raises:
         RecordingError: The arrays are not finite or too short, or a number is not possible.
     """
-    f, z_th = np.asarray(frequency, float), np.asarray(z_th, complex)
-    told = np.asarray(stderr, float)
+    f, told = (np.asarray(unmasked(of), float) for of in (frequency, stderr))
+    z_th = np.asarray(unmasked(z_th), complex)
     rate, order = number_of("sample_rate", sample_rate), operator.index(order)
     _check(f, z_th, told, rate, order)
     told, known = np.broadcast_to(told, f.shape), not told.any()

@@ -85,9 +85,11 @@ def given(
 
     Arrays of NumPy if JAX traces none of them. Whole periods are harmonics, other records bins.
     """
-    v_th, v_out, step, rate = untraced((v_th, v_out, resolution, sample_rate))
-    recorded, xp = unmasked(v_th), namespace(v_th, v_out)
-    v_th, v_out, step = (xp.asarray(unmasked(value), float) for value in (v_th, v_out, step))
+    # A mask would be lost.
+    plain = tuple(map(unmasked, (v_th, v_out, resolution, sample_rate)))
+    v_th, v_out, step, rate = untraced(plain)
+    recorded, xp = v_th, namespace(v_th, v_out)
+    v_th, v_out, step = (xp.asarray(value, float) for value in (v_th, v_out, step))
     periods = whole_periods(v_out.shape[-1], sample_rate, pulse_rate)
     # At harmonics the noise is measured, and its floor is needed only. White noise is a median: by
     # its derivative, few samples would have most of the weight.
@@ -95,7 +97,7 @@ def given(
     of = floor if issubclass(kind, Harmonics) else noise
     step = xp.broadcast_to(step, v_out.shape[:-1])
     of_th, of_out = (constant(xp.asarray(of(v, step))) for v in (v_th, v_out))
-    rates = xp.broadcast_to(unmasked(rate), v_out.shape[:-1])
+    rates = xp.broadcast_to(rate, v_out.shape[:-1])
     lane = kind.of_samples(Measurement(v_th, v_out, of_th, of_out, rates), periods)
     known = None
     if isinstance(lane, Harmonics):

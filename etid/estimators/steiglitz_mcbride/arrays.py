@@ -14,6 +14,7 @@ from etid.estimators.steiglitz_mcbride.iteration import (
 from etid.precision import array_function, in_float64, namespace
 from etid.results.fit import rrse
 from etid.signals.filtering import from_rest
+from etid.signals.missing import unmasked
 from etid.signals.transfer import AnyArray, Rational
 
 
@@ -51,6 +52,7 @@ def steiglitz_mcbride(
         ValueError: x and y have different shapes, a number is not positive, or the records are
             shorter than the filter.
     """
+    x, y = map(unmasked, (x, y))
     xp = namespace(x, y)
     x, y = (xp.asarray(of, float) for of in (x, y))
     zeros = order if zeros is None else zeros
