@@ -11,6 +11,7 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import rounded, significant
+from etid.circuits.impedance import divider
 from etid.circuits.overview import Overview, Overviewed
 from etid.precision import Module, array_function, in_float64, is_traced, namespace
 from etid.signals.filtering import StateSpace, companion, simulate
@@ -108,6 +109,10 @@ class Filter(Overviewed, Module):
         return cls(of.A, of.B[:, 0], of.C, of.D[0], sample_rate)
 
     @property
+    def _states(self) -> StateSpace:
+        return StateSpace(self.A, self.B[:, None], self.C, namespace(self.D).asarray(self.D)[None])
+
+    @property
     def b(self) -> Float[AnyArray, " order1"]:
         """Numerator in powers of z⁻¹, for a₀ = 1."""
         return self._polynomials()[0]
@@ -190,16 +195,14 @@ class Filter(Overviewed, Module):
         if states == 0:
             return self.D * u, xp.zeros((*u.shape[:-1], 0))
         x0 = xp.zeros(states) if x0 is None else xp.asarray(x0, float)
-        system = StateSpace(self.A, self.B[:, None], self.C, xp.asarray(self.D)[None])
-        return simulate(system, u[..., None], x0)
+        return simulate(self._states, u[..., None], x0)
 
     @in_float64
     @array_function
     def divider(self, source: "Filter") -> "Filter":
         """The filter from V_th to V_out = V_th · Z / (Z + Z_th), if this impedance is a load Z.
 
-        One current flows through both, i = (V_th − C_s x_s − C x) / (D_s + D). Nothing is a ratio
-        of polynomials, so that no digits are lost.
+        Nothing is a ratio of polynomials, so that no digits are lost.
 
         Args:
             source: Source impedance Z_th, at the same sample rate.
@@ -213,20 +216,4 @@ class Filter(Overviewed, Module):
                 f"the load has a sample rate of {float(rates[0]):g} Hz and the source of "
                 f"{float(rates[1]):g} Hz; make both filters for one rate"
             )
-        xp, total = namespace(self.A, self.B, source.A, source.B), self.D + source.D
-        count = self.C.shape[0], source.C.shape[0]
-        both = xp.concatenate([self.B, source.B])
-        seen = xp.concatenate([self.C, source.C])
-        apart = xp.concatenate([
-            xp.pad(self.A, ((0, 0), (0, count[1]))),
-            xp.pad(source.A, ((0, 0), (count[0], 0))),
-        ])  # fmt: skip
-        own = xp.pad(self.C, (0, count[1]))
-        share = self.D / total
-        return Filter(
-            apart - both[:, None] * seen / total,
-            both / total,
-            own - share * seen,
-            share,
-            self.sample_rate,
-        )
+        return Filter._of(divider(source._states, self._states), self.sample_rate)

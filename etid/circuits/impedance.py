@@ -363,6 +363,19 @@ def in_series(one: StateSpace, other: StateSpace) -> StateSpace:
     )
 
 
+def divider(source: StateSpace, load: StateSpace) -> StateSpace:
+    """The system V_th → V_out of a load behind a source impedance, both from current to voltage.
+
+    The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances. x₁ are the states of
+    the source, x₂ the states of the load. It holds in continuous and in discrete time.
+    """
+    xp, both = namespace(source.A, load.A), in_series(source, load)
+    total = source.D[0] + load.D[0]
+    B, share = both.B / total, load.D[0] / total
+    C = xp.concatenate([np.zeros(source.C.size), load.C]) - share * both.C
+    return StateSpace(both.A - B * both.C[None, :], B, C, share[None])
+
+
 def _in_parallel(one: StateSpace, other: StateSpace) -> StateSpace:
     """The current i₁ = (C₂x₂ − C₁x₁ + D₂ i) / (D₁ + D₂) flows through the first part."""
     xp, first, second = namespace(one.A, other.A), np.ones(one.C.size), np.ones(other.C.size)

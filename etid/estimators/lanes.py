@@ -206,6 +206,12 @@ class Harmonics(AbstractLane):
         return cls(*[*of, m.sample_rate])
 
     @property
+    def noise_of_x(self) -> tuple[AnyArray, AnyArray | None]:
+        """E|noise|² of X that the weights contain, and what they leave out; None if nothing."""
+        of = self.variance_x
+        return (0 * of, of) if self.exact_input else (of, None)
+
+    @property
     def fields(self) -> Spectrum:
         """The harmonics without the sample rate."""
         of = (self.frequency, self.x, self.y, self.variance_x, self.variance_y, self.selected)

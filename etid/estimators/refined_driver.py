@@ -15,7 +15,7 @@ from etid.likelihood import driver, of_calibrations
 from etid.likelihood.approximate_driver import approximated, departs, needs_order
 from etid.likelihood.calibrations import Calibrations, Near
 from etid.likelihood.linear import inverse
-from etid.likelihood.noise import MISFIT_RRSE, misses, shows_hum
+from etid.likelihood.noise import MISFIT_RRSE, misses, pull_of_ignored, shows_hum
 from etid.likelihood.sandwich import Linear
 from etid.likelihood.source_prior import delay_std, delay_width
 from etid.precision import array_function, namespace, one_thread
@@ -119,11 +119,9 @@ def from_harmonics(
     Where Z_th leaves more than noise, and so does a Z_th with one more section, all but chi2 and
     rrse is that of a Z_th with a smooth error (`etid.likelihood.approximate_driver`).
     """
-    spectrum, r_load = jax.tree.map(np.asarray, (records.fields, r_load))
-    ignored = None
-    if records.exact_input:
-        ignored = spectrum.variance_x
-        spectrum = dataclasses.replace(spectrum, variance_x=0 * ignored)
+    fields = records.fields, records.noise_of_x, r_load
+    spectrum, (of_x, ignored), r_load = jax.tree.map(np.asarray, fields)
+    spectrum = dataclasses.replace(spectrum, variance_x=of_x)
     rate = np.asarray(records.sample_rate)[0]
     bands = banded(spectrum)
     spectra = above_noise(spectrum, bands)
@@ -182,15 +180,15 @@ def _is_biased(
     linear: Linear,
     ignored: Float[np.ndarray, "record bin"] | None,
 ) -> np.bool_:
-    """Whether noise of X that the weights leave out has moved the minimum (`etid.likelihood.fit`).
+    """Whether noise of X that the weights leave out has moved the minimum.
 
     `BIASED` is the square of the move in standard errors of all parameters.
     """
     if ignored is None:
         return np.bool_(False)
     s, slopes = model.spectra, near.slopes
-    weight = model.knots.summed(np.where(s.selected, 2 * ignored / s.variance_y, 0.0))
-    gradient = (weight * (np.conj(slopes.gains) * slopes.by_q).real).sum((-2, -1))
+    weight = np.where(s.selected, 2 * ignored / s.variance_y, 0.0)
+    gradient = pull_of_ignored(model.knots, weight, slopes.gains, slopes.by_q)
     return gradient @ linear.bread() @ gradient > BIASED
 
 

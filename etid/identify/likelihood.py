@@ -8,7 +8,6 @@ voltage profiled out (`etid.likelihood.profile`). Its parameters q are
 z is what the calibrations leave open of Z_th, in their standard deviations; a priori it is normal.
 """
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -30,6 +29,7 @@ from etid.precision import Module, array_function, in_float64, is_traced, namesp
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import MEASURED_CURRENT, MeasuredCurrent
 from etid.results.fit import Fit
+from etid.results.fits import concatenated
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import AnyArray, as_complex
 
@@ -212,8 +212,7 @@ class Likelihood(Overviewed, Module):
         of = self.feed, self.known, self.load.gains.circuit
         if is_traced(self) or self.lane.x.ndim == 1:
             return MAXIMUM_LIKELIHOOD.fit_load(self.lane, *of)
-        parts = MAXIMUM_LIKELIHOOD.fit_rows(unstacked(self.lane), *of)
-        return jax.tree.map(lambda *each: np.concatenate(each), *parts)
+        return concatenated(MAXIMUM_LIKELIHOOD.fit_rows(unstacked(self.lane), *of))
 
     @property
     def _at_knots(self) -> Gains:

@@ -73,7 +73,7 @@ def driver_of_response(
     told, known = np.broadcast_to(told, f.shape), not told.any()
     weight = 1.0 if known else 1 / np.where(told > 0, told, told[told > 0].min())
     of = _like(order)
-    found = [_nearest(of, start, f, z_th, weight, known) for start in _starts(f, z_th, order)]
+    found = [_nearest(of, start, f, z_th, weight, known) for start in _starts(of, f, z_th)]
     best = min(found, key=lambda one: one.cost)
     source = of.of_vector(best.x)
     squares, terms = 2 * best.cost, 2 * f.size - best.x.size
@@ -143,16 +143,17 @@ def _like(order: int) -> SourceImpedance:
 
 
 def _starts(
-    f: Float[np.ndarray, " frequency"], z_th: Complex[np.ndarray, " frequency"], order: int
+    like: SourceImpedance,
+    f: Float[np.ndarray, " frequency"],
+    z_th: Complex[np.ndarray, " frequency"],
 ) -> Iterator[Float[np.ndarray, " parameter"]]:
     """Starts with a resonance at several places, whose gains are those of least squares."""
-    pairs = (order - 1) // 2
-    reals = order - 2 * pairs
+    pairs, reals = like.log_omega.size, like.log_omega_real.size
     for place in PLACES:
         omega = 2 * np.pi * f.max() * np.geomspace(place, 1.0, max(pairs, 1))[:pairs]
         real = 2 * np.pi * f.min() * np.geomspace(3.0, 1e3, reals)
         of = dataclasses.replace(
-            _like(order),
+            like,
             log_omega=np.log(omega),
             log_zeta=np.log(0.5) + 0 * omega,
             log_omega_real=np.log(real),

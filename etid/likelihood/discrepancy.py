@@ -27,7 +27,7 @@ from etid.signals.transfer import AnyArray
 SPACING = 0.35  # of the nodes; a spline through them is good to 1 % of δ of the shortest length
 LENGTHS = 0.5 * 1.3 ** np.arange(8)  # the nearest is 14 % off
 POWERS = np.array([-0.4, 0.0, 0.4, 0.8])  # a low-pass errs by a power of 1 to 2
-NOTHING = 1e-5  # of the variance of a δ
+NOTHING = 1e-5  # of the variance of a δ, which the functions of its length may leave out
 FUNCTIONS = 20  # δ of the shortest length leaves 1e-4 of its variance to others
 
 

@@ -12,7 +12,7 @@ from etid.likelihood import scores
 from etid.likelihood.approximate import approximated, departs, without_delta
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.linear import diagonal, inverse, replaced, taken
-from etid.likelihood.noise import excess, is_smooth, misses, shows_hum
+from etid.likelihood.noise import excess, is_smooth, misses, pull_of_ignored, shows_hum
 from etid.likelihood.profile import rrse
 from etid.likelihood.scores import Linear, Scores
 from etid.likelihood.search import Load, Minimum, Near, minimum, select
@@ -307,17 +307,12 @@ def _is_biased(
     bread: Float[AnyArray, "*row q q"],
     variance: Float[AnyArray, "*row element"],
 ) -> Bool[AnyArray, "*row"]:
-    """Whether noise of X that the weights leave out has moved an element by `BIASED` errors.
-
-    With X + n in place of X, the expected ½ Σ r² is larger by ½ Σ w |G|² E|n|², w = 2/σ². Its
-    gradient moves the minimum.
-    """
+    """Whether noise of X that the weights leave out has moved an element by `BIASED` errors."""
     xp, slopes = namespace(near.q), near.slopes
     if load.ignored is None:
         return xp.zeros(near.q.shape[:-1], bool)
-    weight = load.knots.summed(near.profile.weight * load.ignored[..., None, :])
-    slope = (xp.conj(slopes.gains)[..., None, :, :] * slopes.by_q).real
-    gradient = (weight[..., None, :, :] * slope).sum((-2, -1))
+    weight = near.profile.weight * load.ignored[..., None, :]
+    gradient = pull_of_ignored(load.knots, weight, slopes.gains, slopes.by_q)
     moved = (bread @ gradient[..., None])[..., : load.gains.elements, 0]
     return (xp.abs(moved) > BIASED * xp.sqrt(variance)).any(-1)
 

@@ -4,11 +4,12 @@ The weights of a fit are those of the noise that the record shows, but no model 
 covariance (Jᵀ C J in place of Jᵀ J, White 1980) therefore uses the variance of the residual.
 """
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 
 from etid.precision import namespace
 from etid.results.verdicts import left
 from etid.signals.harmonics import local_sum
+from etid.signals.knots import Knots
 from etid.signals.mains import lines
 from etid.signals.transfer import AnyArray
 
@@ -40,6 +41,21 @@ def excess(
     local = local_sum(total) / freedom
     sure = local > overall * (1 + SURE * xp.sqrt(2 / freedom))
     return xp.where(sure, local, overall)
+
+
+def pull_of_ignored(
+    knots: Knots,
+    weight: Float[AnyArray, "*row output bin"],
+    gains: Complex[AnyArray, "*row output knot"],
+    by_q: Complex[AnyArray, "*row q output knot"],
+) -> Float[AnyArray, "*row q"]:
+    """Gradient of the expected ½ Σ r² by noise n of X that the weights leave out.
+
+    With X + n in place of X it is larger by ½ Σ w |G|² E|n|², w = 2/σ². `weight` is w E|n|².
+    """
+    xp = namespace(by_q)
+    slope = (xp.conj(gains)[..., None, :, :] * by_q).real
+    return (knots.summed(weight)[..., None, :, :] * slope).sum((-2, -1))
 
 
 def shows_hum(

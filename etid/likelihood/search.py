@@ -95,9 +95,9 @@ class Load:
         unloaded = self.unloaded and self.unloaded.of(rows)
         gains, records = self.gains.of(rows), self.records.of(rows)
         transient = self.transient and self.transient.of(rows)
-        ignored = None if self.ignored is None else self.ignored[rows]
         of = {"gains": gains, "records": records, "unloaded": unloaded, "transient": transient}
-        return dataclasses.replace(self, **of, ignored=ignored)
+        of["ignored"] = None if self.ignored is None else self.ignored[rows]
+        return dataclasses.replace(self, **of)
 
     @property
     def has_current(self) -> bool:

@@ -8,8 +8,9 @@ In this laboratory much is a little wrong at once:
 - The converter has 10 bits. Noise and trigger delays are those of the laboratory `noisy`.
 
 **Truth.** R_s, R_p and C_p of such a fingertip are those of the nearest circuit: behind the same
-driver its voltage differs least from that of the fingertip (least squares of the samples, without
-noise, with a free delay). The built circuit and the resistors are exact.
+driver its voltage differs least from that of the fingertip (least squares of the harmonics up to
+the corner of the filter, without noise, with a free delay). The built circuit and the resistors are
+exact.
 """
 
 import dataclasses
@@ -80,9 +81,10 @@ class RoughScene(Scene):
         Returns:
             A study with one recording for each calibration and trial.
         """
-        loaded = functools.cache(lambda load: self._loaded(load, self.waveform().f))
+        f = self.waveform().f
+        loaded = functools.cache(lambda load: self._loaded(load, f))
         return self.record(
-            seed, lambda trial, f: loaded(_layers(skin) if (skin := _skin(trial)) else trial.load)
+            seed, lambda trial, _: loaded(_layers(skin) if (skin := _skin(trial)) else trial.load)
         )
 
     def truth(self) -> dict[str, dict[str, float]]:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from etid.circuits.impedance import Quantity, in_series, realise
+from etid.circuits.impedance import Quantity, divider, realise
 from etid.circuits.overview import Overview
 from etid.precision import Module, in_float64, namespace, untraced
 from etid.results.verdicts import RESULTS, Judged, verdict
@@ -180,17 +180,8 @@ class SourceImpedance(Module):
         return StateSpace(A, B[:, None], C, xp.exp(self.log_resistance)[None])
 
     def connected(self, load: StateSpace) -> StateSpace:
-        """The system V_th → V_out with a load, from current [A] to voltage [V], at the terminal.
-
-        The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances. x₁ are the states
-        of the source, x₂ the states of the load.
-        """
-        z1, z2 = self.state_space(), load
-        xp, both = namespace(z1.A, z2.A), in_series(z1, z2)
-        total = z1.D[0] + z2.D[0]
-        B, share = both.B / total, z2.D[0] / total
-        C = xp.concatenate([np.zeros(z1.C.size), z2.C]) - share * both.C
-        return StateSpace(both.A - B * both.C[None, :], B, C, share[None])
+        """The system V_th → V_out with a load, from current [A] to voltage [V], at the terminal."""
+        return divider(self.state_space(), load)
 
 
 def _wide(

@@ -74,9 +74,7 @@ def load_of(
         y = xp.stack([lane.y, lane.i], -2)
         variance_y = xp.stack([lane.variance_y, lane.variance_i], -2)
         used = xp.stack([lane.selected, lane.selected], -2)
-    of_x, ignored = lane.variance_x, None
-    if lane.exact_input:
-        of_x, ignored = 0 * of_x, of_x
+    of_x, ignored = lane.noise_of_x
     records = Records(lane.frequency, lane.x, of_x, y, variance_y, used)
     unloaded = None
     if shared is not None and shared.x.shape[-1] == records.x.shape[-1]:
