@@ -2,13 +2,15 @@
 
 import json
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
 from benchmarks.spice import BOUND, scene_of
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 KNOWN = (Trial("calibration/0", ResistorLoad(98.8e3)),)
@@ -100,3 +102,33 @@ def test_a_fit_from_a_current_has_the_errors_of_the_bound():
 def test_a_scene_without_a_bound_is_told_why(scene, text):
     with pytest.raises(ValueError, match=text):
         etid.bound(scene)
+
+
+@pytest.mark.parametrize("way", ["voltage", "both", "current"])
+def test_jax_differentiates_a_bound_by_pulse_resistor_load_and_noise(way):
+    def relative(q):
+        width, ohm, r_s, r_p, c_p, snr = q * typical
+        load = etid.SkinRC(r_s, r_p, c_p)
+        known = () if way == "current" else (Trial("calibration/0", ResistorLoad(ohm)),)
+        driver = TransformerDriver(width=width)
+        noise = {"snr_db": snr, "bits": None}
+        if way != "voltage":
+            noise["current_snr_db"] = snr
+        scene = Scene((Trial("a", load),), known, driver=driver, **noise)
+        return jnp.stack(list(etid.bound(scene)["a"].relative.values()))
+
+    typical = np.array([0.7e-3, 50e3, 33.4e3, 186e3, 0.12e-9, 60.0])
+    at, step = np.ones(typical.size), 2e-5 * np.eye(typical.size)
+    found, slopes = jax.jit(lambda q: (relative(q), jax.jacfwd(relative)(q)))(at)
+    np.testing.assert_allclose(found, relative(at), rtol=1e-9)
+    # Zeros of the pulse move with its width: third order leaves 2e-6, and rounding 1e-7.
+    differences = [(relative(at + one) - relative(at - one)) / 4e-5 for one in step]
+    np.testing.assert_allclose(slopes.T, differences, rtol=1e-5, atol=1e-6 * np.abs(found).max())
+
+
+def test_the_covariance_of_a_bound_is_that_of_the_elements():
+    bound = etid.bound(etid.scenes.paper_dry())["typical/dry/01"]
+    np.testing.assert_allclose(np.sqrt(np.diagonal(bound.cov)), list(bound.stderr.values()))
+    relative = np.sqrt(np.diagonal(bound.log_cov))
+    np.testing.assert_allclose(relative, list(bound.relative.values()))
+    np.testing.assert_allclose(relative * bound.circuit.values(), list(bound.stderr.values()))

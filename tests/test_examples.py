@@ -17,6 +17,7 @@ SHORT = {
 LONG = {
     "batches": "NumPy, nothing compiled: first",
     "correct_driver": "% corrected",
+    "design": "found: pulse 688",
     "hierarchy": "r_p of the population: 1.8",
     "own_prior": "with: ",
     "own_solver": "jaxopt: [3.344",

@@ -1,5 +1,6 @@
 """Predicted voltages, in NumPy and in JAX."""
 
+import dataclasses
 import functools
 
 import jax
@@ -48,3 +49,22 @@ def test_jax_differentiates_a_prediction_by_the_elements(case):
     ways = step * np.eye(logs.size)
     numeric = [(squares(logs + way) - squares(logs - way)) / (2 * step) for way in ways]
     np.testing.assert_allclose(slope, numeric, rtol=0, atol=1e-5 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("circuit", [DRY, COLE], ids=["in time", "whole periods"])
+def test_jax_differentiates_a_prediction_by_the_driver(circuit):
+    recording, _, driver = recorded()
+
+    def squares(level):
+        """Of the residual, with the logarithm of a resistance in the driver moved."""
+        source = dataclasses.replace(driver.source, log_resistance=level)
+        of = dataclasses.replace(driver, source=source)
+        rest = etid.predict(recording, of, circuit) - recording.v_out
+        return (jnp if isinstance(level, jax.Array) else np).nansum(rest**2)
+
+    level = np.asarray(driver.source.log_resistance)
+    value, slope = jax.jit(jax.value_and_grad(squares))(jnp.asarray(level))
+    np.testing.assert_allclose(value, squares(level), rtol=1e-9)
+    step = 1e-4  # leaves step² of the third derivative
+    numeric = (squares(level + step) - squares(level - step)) / (2 * step)
+    np.testing.assert_allclose(slope, numeric, rtol=1e-4)

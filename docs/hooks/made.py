@@ -59,8 +59,8 @@ def table_of_tests():
 
 
 PROGRAMS = (
-    "waveform", "own_circuit", "own_solver", "own_prior", "profile", "hierarchy", "batches",
-    "correct_driver", "pulse", "any_record",
+    "waveform", "design", "own_circuit", "own_solver", "own_prior", "profile", "hierarchy",
+    "batches", "correct_driver", "pulse", "any_record",
 )  # fmt: skip
 
 

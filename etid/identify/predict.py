@@ -43,7 +43,7 @@ def predict(
     """Predict the terminal voltage [V] of a recording, for plots and residuals.
 
     The function fits the state at the start of the record and an offset to `recording.v_out`. JAX
-    can differentiate it by the elements of the circuit.
+    can differentiate it by the elements of the circuit, and by the numbers of the driver.
 
     Args:
         recording: Unloaded and loaded voltage.
@@ -109,7 +109,7 @@ def _predict_periods(
         rate,
         driver.source.response(frequency),
         circuit.response(frequency),
-        float(driver.calibration.r_load[0]),
+        untraced(driver.calibration.r_load[0]),
     )
     xp, after = namespace(aligned), recording.v_out.size - samples
     return xp.pad(xp.roll(aligned, seen.lag), (0, after), constant_values=np.nan)
@@ -151,7 +151,9 @@ def fitted_voltage(
     free = simulate(alone, np.zeros((forced.size, 0)), np.eye(states))[0]
     known, late = [*free, xp.ones_like(forced)], None  # a measured current has no calibration
     if isinstance(feed.source, SourceImpedance):
-        late = hold(_delayed_calibration(feed.source, load, loop, float(feed.r_known)), sample_rate)
+        late = hold(
+            _delayed_calibration(feed.source, load, loop, untraced(feed.r_known)), sample_rate
+        )
     degrees, powers = np.arange(1.0, inputs.shape[1]), np.arange(1.0, delayed.shape[1])
     rates = np.pad(inputs[:, 1:] * degrees, ((0, 0), (0, 1)))  # per sample
 
@@ -199,7 +201,7 @@ def _least_squares(
 
 
 def _delayed_calibration(
-    source: SourceImpedance, load: StateSpace, loop: StateSpace, r_load: float
+    source: SourceImpedance, load: StateSpace, loop: StateSpace, r_load: Float[AnyArray, ""]
 ) -> StateSpace:
     """From the rate of V_th to V_out by a late calibration; the delays of V_out belong to it too.
 
@@ -231,7 +233,7 @@ def periodic_voltage(
     sample_rate: float,
     z_th: Complex[AnyArray, " frequency"],
     z_load: Complex[AnyArray, " frequency"],
-    r_load: float,
+    r_load: float | Float[AnyArray, ""],
 ) -> Float[AnyArray, " time"]:
     """Terminal voltage [V] with a load, aligned with a record.
 

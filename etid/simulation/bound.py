@@ -15,26 +15,28 @@ Identification, 2012, ch. 9 and 16; `etid.likelihood.profile`)
 and that about the elements and the delays, with Z_th projected out,
 
     F = Re Σ_k (Aᴴ P A − Aᴴ P B Bᴴ P A / Bᴴ P B),      A = ∂G/∂q,      B = ∂G/∂Z_th.
+
+All of it is a function of the numbers of the driver and of the loads, in the namespace of these: a
+pulse or a resistor can be designed by the gradient of a bound.
 """
 
 import dataclasses
 import math
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
+from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC, with_slopes
 from etid.circuits.display import per_cent
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.identify.arguments import require
-from etid.precision import in_float64
+from etid.precision import array_function, in_float64, namespace
 from etid.signals.harmonics import whole_periods
 from etid.signals.rounding import COARSE, is_coarse, rounding_variance
+from etid.signals.transfer import AnyArray, power
 from etid.simulation.scenes import Scene, Trial, Waveform
-from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
+from etid.simulation.transformer import Number, ResistorLoad, SkinLoad
 from etid.solvers.matrices import inverse
 
 
@@ -45,23 +47,32 @@ class Bound(Overviewed):
     Attributes:
         path: Path of the trial.
         circuit: True elements of its load [SI].
-        cov: Bound of the covariance of the logarithms of the elements.
+        log_cov: Bound of the covariance of the logarithms of the elements.
+
+    Its numbers are arrays of JAX if it traces the scene.
     """
 
     path: str
     circuit: AbstractCircuit
-    cov: Float[np.ndarray, "element element"]
+    log_cov: Float[AnyArray, "element element"]
 
     @property
-    def relative(self) -> dict[str, float]:
+    def cov(self) -> Float[AnyArray, "element element"]:
+        """Bound of the covariance of the elements [SI], as that of a fit."""
+        values = self.circuit.values()
+        return self.log_cov * values[:, None] * values
+
+    @property
+    def relative(self) -> dict[str, Number]:
         """Bound of the relative standard error of each element."""
-        errors = np.sqrt(np.diagonal(self.cov))
-        return {name: float(e) for name, e in zip(self.circuit.names(), errors, strict=True)}
+        errors = namespace(self.log_cov).sqrt(self.log_cov.diagonal())
+        return dict(zip(self.circuit.names(), _numbers(errors), strict=True))
 
     @property
-    def stderr(self) -> dict[str, float]:
+    def stderr(self) -> dict[str, Number]:
         """Bound of the standard error of each element [SI]."""
-        return {name: e * float(getattr(self.circuit, name)) for name, e in self.relative.items()}
+        errors = namespace(self.log_cov).sqrt(self.cov.diagonal())
+        return dict(zip(self.circuit.names(), _numbers(errors), strict=True))
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -84,6 +95,11 @@ class Bound(Overviewed):
         return Overview(title, rows, notes=notes)
 
 
+def _numbers(of: Float[AnyArray, " element"]) -> list[Number]:
+    """Numbers of Python, or of JAX."""
+    return of.tolist() if namespace(of) is np else list(of)
+
+
 class Bounds(Overviewed, dict[str, Bound]):
     """The bound of each trial of a scene, by path."""
 
@@ -100,6 +116,7 @@ class Bounds(Overviewed, dict[str, Bound]):
 
 
 @in_float64
+@array_function
 def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> Bounds:
     """Predict the smallest standard errors of each trial of a scene before it is recorded.
 
@@ -107,6 +124,10 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> B
     the scene records the current, the bound uses it too, and the scene needs no calibration. The
     information is proportional to the length of a record: half a period has half the information of
     a whole period.
+
+    JAX differentiates and maps it by the numbers of the driver, of the loads, and by `snr_db`, as
+    `examples/design.py` does. Rates and lengths are numbers: the harmonics depend on them. The
+    rounding of a coarse converter counts as white noise then.
 
     Args:
         scene: Driver, loads, noise and converter. The loads are circuits, resistors or skin.
@@ -130,19 +151,22 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> B
             "recorded (current_snr_db)"
         )
     waveform = scene.waveform()
-    if waveform.sigma == 0:
+    traced = namespace(waveform.sigma, waveform.v_th) is not np
+    if not traced and waveform.sigma == 0:
         raise ValueError("the scene has neither noise nor a converter; every bound is zero")
     inside = waveform.f < scene.sample_rate / 2
     f, z_th = waveform.f[inside], waveform.z_th[inside]
-    x = waveform.v_th[inside] * math.sqrt(scene.samples) / waveform.noise[inside]
+    x = waveform.v_th[inside] * (math.sqrt(scene.samples) / waveform.noise[inside])
     known = [] if known_driver else [_circuit(trial) for trial in scene.calibration]
-    found: dict[tuple, Float[np.ndarray, "n n"]] = {}  # trials with the same load share a bound
+    found: dict[int, Float[AnyArray, "n n"]] = {}  # trials with the same load share a bound
     bounds = Bounds()
     for trial in scene.trials:
         circuit = _circuit(trial)
-        key = (type(circuit), *np.asarray(circuit.values()))
+        key = id(trial.load)
         if key not in found:
-            noise = _noise(scene, trial, waveform, f.size)
+            noise = np.ones((2 + 2 * len(scene.calibration), f.size))
+            if not traced:
+                noise = _noise(scene, trial, waveform, f.size)
             current = _current_noise(scene, circuit, waveform)[inside] if measured else None
             signals = _Signals(f, x, z_th, noise, current)
             found[key] = _covariance(
@@ -198,9 +222,9 @@ def _noise(
 
 def _current_noise(
     scene: Scene, circuit: AbstractCircuit, waveform: Waveform
-) -> Float[np.ndarray, " f"]:
+) -> Float[AnyArray, " f"]:
     """Standard deviations of the recorded current [A] relative to those of a voltage [V]."""
-    load = np.asarray(circuit.response(jnp.asarray(waveform.f)))
+    load = circuit.response(waveform.f)
     sigma = scene.current_noise(waveform.v_th / (load + waveform.z_th))
     return sigma * scene.colour(waveform.f) / waveform.noise
 
@@ -217,10 +241,10 @@ class _Signals(NamedTuple):
     """
 
     f: Float[np.ndarray, " f"]
-    x: Complex[np.ndarray, " f"]
-    z_th: Complex[np.ndarray, " f"]
+    x: Complex[AnyArray, " f"]
+    z_th: Complex[AnyArray, " f"]
     noise: Float[np.ndarray, "row f"]
-    current: Float[np.ndarray, " f"] | None
+    current: Float[AnyArray, " f"] | None
 
 
 def _covariance(
@@ -230,46 +254,48 @@ def _covariance(
     delays: bool,
     known_driver: bool,
     shared_v_th: bool,
-) -> Float[np.ndarray, "element element"]:
+) -> Float[AnyArray, "element element"]:
     """Bound of the covariance of the elements' logarithms."""
     f, x, z_th, noise, current = signals
-    frequency, loads = jnp.asarray(f), [circuit, *known]
-    z = [np.asarray(load.response(frequency)) for load in loads]
-    slope = jax.jacfwd(lambda log: circuit.with_log_values(log).response(frequency))(
-        circuit.log_values()
-    )
+    loads = [circuit, *known]
+    z = [load.response(f) for load in loads]
+    xp = namespace(x, z_th, *z)
+    slope = with_slopes(circuit, xp.asarray(circuit.log_values()), f)[1]  # by each element
     of_v_out, of_v_th = noise[: len(loads)], noise[len(loads) :]
     if known_driver or known:
         loop = 1 / (z[0] + z_th)
         outputs = [(z[0] * loop, z_th * loop**2, of_v_out[0])]
         if current is not None:
             outputs.append((loop, -(loop**2), current))
-        gains, by_load, of_y = (np.stack(of) for of in zip(*outputs, strict=True))
+        gains, by_load, of_y = (xp.stack(of) for of in zip(*outputs, strict=True))
         record = np.append(np.zeros(len(outputs), int), np.arange(1, len(loads)))
-        total = np.stack([*[z[0]] * len(outputs), *z[1:]]) + z_th
-        gains = np.stack([*gains, *(loading(of, z_th) for of in z[1:])])
-        of_y, by_z_th = np.stack([*of_y, *of_v_out[1:]]), -gains / total
+        total = xp.stack([*[z[0]] * len(outputs), *z[1:]]) + z_th
+        gains = xp.stack([*gains, *(of / (of + z_th) for of in z[1:])])
+        of_y, by_z_th = xp.stack([*of_y, *of_v_out[1:]]), -gains / total
         record, of_x = (0 * record, of_v_th[:1]) if shared_v_th else (record, of_v_th)
     else:
-        x, gains, by_load, by_z_th = x / (z[0] + z_th), np.stack(z[:1]), np.ones((1, f.size)), None
+        x, gains, by_z_th = x / (z[0] + z_th), xp.stack(z[:1]), None
+        by_load = np.ones((1, f.size))
         assert current is not None  # there is a calibration, or the current is recorded
         of_y, record, of_x = of_v_out[:1], np.zeros(1), current[None]
-    count, elements = gains.shape[0], slope.shape[1]
-    a = np.zeros((count, elements + count, f.size), complex)
-    a[: len(by_load), :elements] = by_load[:, None] * np.asarray(slope).T
-    turn = 2j * np.pi * f * 1e-6  # delays in microseconds
-    a[range(count), range(elements, elements + count)] = -turn * gains
-    a = a if delays else a[:, :elements]
-    p = np.zeros((count, count, f.size), complex)
+    count, elements = gains.shape[0], slope.shape[0]
+    of_load = xp.zeros((count - len(by_load), elements, f.size))
+    a = xp.concatenate([by_load[:, None] * slope, of_load])
+    if delays:
+        turn = 2j * np.pi * f * 1e-6  # delays in microseconds
+        own = np.eye(count)[:, :, None] * (-turn * gains)[:, None]
+        a = xp.concatenate([a, own], 1)
+    p = xp.zeros((count, count, f.size), complex)
     for number, deviation in enumerate(of_x):
         w = (record == number)[:, None] / of_y**2
-        tau = 1 / deviation**2 + np.sum(w * np.abs(gains) ** 2, axis=0)
-        p += np.eye(count)[:, :, None] * w - (w * gains)[:, None] * np.conj(w * gains) / tau
-    p *= 2 * np.abs(x) ** 2
-    by_p = np.einsum("mnk,nqk->mqk", p, a)
-    information = np.einsum("mpk,mqk->pq", np.conj(a), by_p).real
+        tau = 1 / deviation**2 + xp.sum(w * power(gains), axis=0)
+        p = p + np.eye(count)[:, :, None] * w
+        p = p - (w * gains)[:, None] * xp.conj(w * gains) / tau
+    p = p * (2 * power(x))
+    by_p = xp.einsum("mnk,nqk->mqk", p, a)
+    information = xp.einsum("mpk,mqk->pq", xp.conj(a), by_p).real
     if by_z_th is not None and not known_driver:
-        cross = np.einsum("mk,mqk->qk", np.conj(by_z_th), by_p)
-        of_z_th = np.einsum("mk,mnk,nk->k", np.conj(by_z_th), p, by_z_th).real
-        information -= np.einsum("pk,qk->pq", np.conj(cross), cross / of_z_th).real
-    return np.asarray(inverse(jnp.asarray(information)))[:elements, :elements]
+        cross = xp.einsum("mk,mqk->qk", xp.conj(by_z_th), by_p)
+        of_z_th = xp.einsum("mk,mnk,nk->k", xp.conj(by_z_th), p, by_z_th).real
+        information = information - xp.einsum("pk,qk->pq", xp.conj(cross), cross / of_z_th).real
+    return inverse(information)[:elements, :elements]

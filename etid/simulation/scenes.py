@@ -37,15 +37,17 @@ from jaxtyping import Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
-from etid.precision import in_float64
+from etid.precision import in_float64, namespace
 from etid.recordings.fields import LABELS, tidy_path
 from etid.recordings.recording import Recording, Samples
 from etid.recordings.study import Study
+from etid.signals.transfer import AnyArray
 from etid.simulation.electronics import INSTRUMENTS as INSTRUMENTS
 from etid.simulation.electronics import Electronics as Electronics
 from etid.simulation.published import BUILT, FINGERTIPS, REFERENCE, TABLE_1, TYPICAL
 from etid.simulation.transformer import (
     Impedance,
+    Number,
     OpenLoad,
     ResistorLoad,
     Sampler,
@@ -103,10 +105,10 @@ class Waveform:
     """
 
     f: Float[np.ndarray, " f"]
-    v_th: Complex[np.ndarray, " f"]
-    z_th: Complex[np.ndarray, " f"]
-    noise: Float[np.ndarray, " f"]
-    sigma: float
+    v_th: Complex[AnyArray, " f"]
+    z_th: Complex[AnyArray, " f"]
+    noise: Float[AnyArray, " f"]
+    sigma: Number
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -149,8 +151,8 @@ class Scene(Overviewed):
     samples: int = 10_000
     start: float = 0.0
     antialias: float = 0.4
-    snr_db: float | None = 60.0
-    current_snr_db: float | None = None
+    snr_db: Number | None = 60.0
+    current_snr_db: Number | None = None
     trigger_jitter_rms: float = 0.0
     offset_rms: float = 0.0
     shared_v_th: bool = False
@@ -195,7 +197,7 @@ class Scene(Overviewed):
             )
         for name in ("snr_db", "current_snr_db"):
             value = getattr(self, name)
-            if value is not None and not value > -math.inf:
+            if value is not None and namespace(value) is np and not value > -math.inf:
                 raise ValueError(f"{name} is {value}; give a number, or None")
         for name in ("trigger_jitter_rms", "offset_rms"):
             if not getattr(self, name) >= 0:
@@ -294,8 +296,9 @@ class Scene(Overviewed):
         step = self._converter()[0] if self.bits is not None else 0.0
         own = 0.0 if self.electronics is None else self.electronics.converter_noise
         own = math.hypot(own, step / math.sqrt(12))
-        noise = np.hypot(sigma * self.colour(sampler.f), own) / self.scale
-        total = math.hypot(sigma, own) / self.scale
+        xp = namespace(sigma)
+        noise = xp.hypot(sigma * self.colour(sampler.f), own) / self.scale
+        total = xp.hypot(sigma, own) / self.scale
         return Waveform(sampler.f, v_th * sampler.antialias, z_th, noise, total)
 
     def colour(self, f: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
@@ -332,7 +335,7 @@ class Scene(Overviewed):
         corner = self.antialias * self.sample_rate
         return self.electronics.noise(rng, sigma, shape, corner, self.sample_rate)
 
-    def current_noise(self, current: Complex[np.ndarray, " f"]) -> float:
+    def current_noise(self, current: Complex[AnyArray, " f"]) -> Number:
         """Standard deviation of the noise of a recorded current.
 
         Args:
@@ -343,8 +346,9 @@ class Scene(Overviewed):
         """
         if self.current_snr_db is None:
             raise ValueError("the scene records no current; set current_snr_db")
-        effective = np.sqrt(2 * np.sum(np.abs(current) ** 2))
-        return float(effective) * 10 ** (-self.current_snr_db / 20)
+        xp = namespace(current)
+        effective = xp.sqrt(2 * xp.sum(xp.abs(current) ** 2))
+        return effective * 10 ** (-self.current_snr_db / 20)
 
     def _measured_current(
         self, sampler: Sampler, coefficients: Complex[np.ndarray, " f"], rng: np.random.Generator
@@ -355,7 +359,7 @@ class Scene(Overviewed):
         exact = sampler.sample(coefficients, self.samples, self.start + delay)
         return exact + self._noise(rng, noise, (self.samples,))
 
-    def _exact(self) -> tuple[Sampler, np.ndarray, np.ndarray, float]:
+    def _exact(self) -> tuple[Sampler, AnyArray, AnyArray, Number]:
         """Sampler, Fourier coefficients of V_th [V], Z_th [ohm] and noise [V at the converter]."""
         sampler = Sampler(
             self.sample_rate,

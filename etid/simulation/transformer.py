@@ -22,15 +22,23 @@ import dataclasses
 import math
 from collections.abc import Callable
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from etid.circuits.display import quantity
+from etid.precision import namespace
+from etid.signals.transfer import AnyArray
 from etid.simulation.electronics import Electronics
 
-Impedance = Callable[[Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]]
+Impedance = Callable[[Float[np.ndarray, " f"]], Complex[AnyArray, " f"]]
 """A load: a function from frequencies [Hz] to impedance [ohm]."""
+
+if TYPE_CHECKING:  # simulations compute with numbers
+    Number = float
+else:  # JAX may trace those of a bound
+    Number = float | Float[Array, ""]
 
 # [samples] Longest repeating block for one inverse FFT; a longer block is summed directly.
 _MAX_BLOCK = 1_000_000
@@ -67,27 +75,27 @@ class TransformerDriver:
         c_divider: Input capacitance of the measuring divider [F].
     """
 
-    amplitude: float = 4.2
-    width: float = 0.04 / 60.0
-    edge: float = 250e-9
-    lead_in: float = 120e-6
-    r_source: float = 30.0
-    c_primary: float = 80e-9
-    r_primary: float = 18.0
-    l_primary: float = 165e-6
-    l_magnetising: float = 0.19
-    r_core: float = 6.8e3
-    turns: float = 12.0
-    r_secondary: float = 1.2e3
-    l_secondary: float = 25e-3
-    c_secondary: float = 55e-12
-    c_winding: float = 6e-12
-    r_protection: float = 4.7e3
-    c_cable: float = 75e-12
-    r_divider: float = 2.2e6
-    c_divider: float = 24e-12
+    amplitude: Number = 4.2
+    width: Number = 0.04 / 60.0
+    edge: Number = 250e-9
+    lead_in: Number = 120e-6
+    r_source: Number = 30.0
+    c_primary: Number = 80e-9
+    r_primary: Number = 18.0
+    l_primary: Number = 165e-6
+    l_magnetising: Number = 0.19
+    r_core: Number = 6.8e3
+    turns: Number = 12.0
+    r_secondary: Number = 1.2e3
+    l_secondary: Number = 25e-3
+    c_secondary: Number = 55e-12
+    c_winding: Number = 6e-12
+    r_protection: Number = 4.7e3
+    c_cable: Number = 75e-12
+    r_divider: Number = 2.2e6
+    c_divider: Number = 24e-12
 
-    def v_th_spectrum(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
+    def v_th_spectrum(self, f: Float[np.ndarray, " f"]) -> Complex[AnyArray, " f"]:
         """Fourier transform of one unloaded pulse, ∫ v_th(t) e^(−j2πft) dt.
 
         The Fourier coefficient of the harmonic at f is this transform times the pulse rate.
@@ -98,12 +106,13 @@ class TransformerDriver:
         Returns:
             Spectrum at the terminal [V s].
         """
+        xp = namespace(self.lead_in, self.width, self.edge)
         centre = self.lead_in + (self.width + self.edge) / 2
-        trapezoid = self.width * np.sinc(f * self.width) * np.sinc(f * self.edge)
-        source = self.amplitude * trapezoid * np.exp(-2j * np.pi * f * centre)
+        trapezoid = self.width * xp.sinc(f * self.width) * xp.sinc(f * self.edge)
+        source = self.amplitude * trapezoid * xp.exp(-2j * np.pi * f * centre)
         return source * self._thevenin(f)[0]
 
-    def z_th(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
+    def z_th(self, f: Float[np.ndarray, " f"]) -> Complex[AnyArray, " f"]:
         """Source impedance at the terminal.
 
         Args:
@@ -116,7 +125,7 @@ class TransformerDriver:
 
     def branches(
         self, f: Float[np.ndarray, " f"]
-    ) -> tuple[Complex[np.ndarray, " f"], Complex[np.ndarray, " f"], Complex[np.ndarray, " f"]]:
+    ) -> tuple[Complex[AnyArray, " f"], Complex[AnyArray, " f"], Complex[AnyArray, " f"]]:
         """z_1, z_m and z_2 of the T circuit, referred to the secondary.
 
         Args:
@@ -133,7 +142,7 @@ class TransformerDriver:
 
     def _thevenin(
         self, f: Float[np.ndarray, " f"]
-    ) -> tuple[Complex[np.ndarray, " f"], Complex[np.ndarray, " f"]]:
+    ) -> tuple[Complex[AnyArray, " f"], Complex[AnyArray, " f"]]:
         """Gain from the source to the open terminal, and the source impedance there [ohm]."""
         s = 2j * np.pi * f
         n = self.turns
@@ -169,14 +178,14 @@ class ResistorLoad:
         r: Resistance [ohm].
     """
 
-    r: float
+    r: Number
 
     def __str__(self) -> str:
         return quantity(self.r, "ohm")
 
-    def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
+    def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[AnyArray, " f"]:
         """Impedance [ohm] at frequencies f [Hz]."""
-        return np.full(f.shape, complex(self.r))
+        return self.r + np.zeros(f.shape, complex)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,15 +198,15 @@ class SkinLoad:
         c_p: Parallel capacitance [F].
     """
 
-    r_s: float
-    r_p: float
-    c_p: float
+    r_s: Number
+    r_p: Number
+    c_p: Number
 
     def __str__(self) -> str:
         units = {"r_s": "ohm", "r_p": "ohm", "c_p": "farad"}
         return ", ".join(f"{of} {quantity(getattr(self, of), unit)}" for of, unit in units.items())
 
-    def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
+    def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[AnyArray, " f"]:
         """Impedance [ohm] at frequencies f [Hz]."""
         return self.r_s + self.r_p / (1 + 2j * np.pi * f * self.r_p * self.c_p)
 
@@ -250,7 +259,7 @@ class Sampler:
         self.f = self.harmonics * pulse_rate
         self.antialias = filtering.response(self.f, corner)
 
-    def rms(self, coefficients: Complex[np.ndarray, " f"]) -> float:
+    def rms(self, coefficients: Complex[AnyArray, " f"]) -> Number:
         """Effective value over one period of the voltage at the converter.
 
         Args:
@@ -259,7 +268,9 @@ class Sampler:
         Returns:
             Root mean square after the anti-alias filter [V].
         """
-        return float(np.sqrt(2 * np.sum(np.abs(coefficients * self.antialias) ** 2)))
+        at_converter = coefficients * self.antialias
+        xp = namespace(at_converter)
+        return xp.sqrt(2 * xp.sum(xp.abs(at_converter) ** 2))
 
     def sample(
         self, coefficients: Complex[np.ndarray, " f"], samples: int, start: float
