@@ -59,10 +59,10 @@ class NormalEquations(NamedTuple):
         objective = xp.where(finite, objective, np.inf)
         return cls(objective, gradient, rows @ rows.swapaxes(-1, -2), terms, rows)
 
-    def along(self, free: Bool[AnyArray, " q"]) -> "NormalEquations":
+    def along(self, free: Bool[AnyArray, "*#row q"]) -> "NormalEquations":
         """The same with the other parameters fixed."""
-        xp = namespace(self.matrix, free)
-        matrix = xp.where(free[:, None] & free, self.matrix, np.eye(free.shape[0]))
+        xp, both = namespace(self.matrix, free), free[..., :, None] & free[..., None, :]
+        matrix = xp.where(both, self.matrix, np.eye(free.shape[-1]))
         return self._replace(gradient=xp.where(free, self.gradient, 0.0), matrix=matrix)
 
     @property
@@ -191,8 +191,13 @@ class LevenbergMarquardt:
         none = xp.zeros_like(first.objective)
         counted, finite = xp.zeros(none.shape, int), xp.isfinite(first.objective)
         of = enough + none, xp.zeros_like(start), self.damping + none, counted, start
-        state = self._proposed(problem, State(start, first, *of, finite, counted))
-        if xp is np:
+        return self.further(
+            problem, self._proposed(problem, State(start, first, *of, finite, counted))
+        )
+
+    def further(self, problem: Problem, state: State) -> State:
+        """The minimum from where a search was."""
+        if namespace(state.q) is np:
             return self._row_by_row(problem, state)
         return repeated(lambda state: self._step(problem, state), state, self.steps)
 

@@ -1,4 +1,4 @@
-"""Least squares: Levenberg-Marquardt, harmonic balance, and propagation of errors.
+"""Inverses and roots of matrices, and importance sampling.
 
-Models do not belong here: the solvers see only residuals and normal equations.
+Models do not belong here: the solvers see only numbers and functions.
 """
