@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from etid.circuits.circuit import AbstractCircuit, impedance_at
+from etid.circuits.circuit import AbstractCircuit, dimensions, impedance_at
 from etid.circuits.impedance import AbstractConnection, AbstractImpedance
 from etid.precision import namespace
 
@@ -98,12 +98,8 @@ def _log_time(circuit: AbstractCircuit, logs: Any, branch: Branch) -> Any:
     exponents = [value for value, unit in zip(values, units, strict=True) if unit == "1"]
     xp: Any = np if isinstance(logs, np.ndarray) else jnp
     alpha = xp.exp(exponents[0]) if exponents else 0.8  # as `AbstractCircuit.scaling` has it
-    powers = {  # of impedance and of time
-        "ohm": (1.0, 0.0),
-        "farad": (-1.0, 1.0),
-        "henry": (1.0, 1.0),
-        "siemens second^alpha": (-1.0, alpha),
-    }
+    # A current has no time; it would leave a determinant of 0 with a resistance.
+    powers = {unit: of for unit, of in dimensions(alpha).items() if unit not in ("ampere", "1")}
     known = [(*powers[unit], value) for value, unit in zip(values, units, strict=True)
              if unit in powers]  # fmt: skip
     levels, times = ([one[row] for one in known] for row in (0, 1))

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid.circuits.diffusion import diffusion
 from etid.circuits.display import DISPLAY
 from etid.circuits.elements import (
     Exponent,
@@ -28,7 +29,6 @@ from etid.circuits.elements import (
     Second,
     capacitor,
     cole,
-    diffusion,
     resistor,
 )
 from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
@@ -49,7 +49,8 @@ def parameter(unit: str, *, typical: float) -> Any:
 
     Args:
         unit: `"ohm"`, `"farad"`, `"henry"`, `"second"`, `"ampere"`, `"siemens second^alpha"` for
-            the Q of a constant-phase element, or `"1"` for its exponent.
+            the Q of a constant-phase element, `"1"` for its exponent, `"ohm second^-1/2"` for a
+            Warburg element, or `"second ohm^(1/alpha)"` for a modified inductance.
         typical: Expected magnitude in the SI unit; a fit may start at this value.
 
     Returns:
@@ -63,6 +64,21 @@ def parameter(unit: str, *, typical: float) -> Any:
     return eqx.field(
         default=typical, converter=_numbers, metadata={"unit": unit, "typical": typical}
     )
+
+
+def dimensions(alpha: Any) -> dict[str, tuple[Any, Any]]:
+    """Powers of impedance and of time in each unit, for a circuit with the exponent α."""
+    return {
+        "ohm": (1.0, 0.0),
+        "farad": (-1.0, 1.0),
+        "henry": (1.0, 1.0),
+        "second": (0.0, 1.0),
+        "ampere": (-1.0, 0.0),
+        "siemens second^alpha": (-1.0, alpha),
+        "ohm second^-1/2": (1.0, -0.5),
+        "second ohm^(1/alpha)": (1 / alpha, 1.0),
+        "1": (0.0, 0.0),
+    }
 
 
 def _numbers(value: Any) -> Any:
@@ -121,15 +137,7 @@ class AbstractCircuit(_Titled, Overviewed, Module):
     @classmethod
     def scaling(cls) -> Float[np.ndarray, "2 parameter"]:
         """Powers of impedance and of time scale to which each parameter is proportional."""
-        powers = {
-            "ohm": (1.0, 0.0),
-            "farad": (-1.0, 1.0),
-            "henry": (1.0, 1.0),
-            "second": (0.0, 1.0),
-            "ampere": (-1.0, 0.0),
-            "siemens second^alpha": (-1.0, 0.8),  # for a typical α; used only for starts of a fit
-            "1": (0.0, 0.0),
-        }
+        powers = dimensions(0.8)  # for a typical α; used only for starts of a fit
         return np.array([powers[unit] for unit in cls.units().values()]).T
 
     @in_float64
@@ -205,7 +213,7 @@ class AbstractCircuit(_Titled, Overviewed, Module):
         return Overview(f"{kind}{batch}{formula}", element_rows(self.units(), values))
 
     def _may_be_one(self, values: np.ndarray) -> bool:
-        """Whether elements are of a size that they can have: not negative, not 1e6 times another.
+        """Whether elements are of a size that they can have: not negative, not 1e12 times another.
 
         Elements that are not a finite number, or 0, are those of a fit that failed.
         """
@@ -213,7 +221,7 @@ class AbstractCircuit(_Titled, Overviewed, Module):
         size = np.abs(values / typical)
         known = np.isfinite(values) & (size > 0)
         return bool(np.all(values[np.isfinite(values)] >= 0)) and not np.any(
-            known & ((size > 1e6) | (size < 1e-6))
+            known & ((size > 1e12) | (size < 1e-12))  # batteries have 1 mΩ and 100 F
         )
 
     def __repr__(self) -> str:

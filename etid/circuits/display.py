@@ -16,6 +16,8 @@ DISPLAY = {
     "ampere": (1e-3, "mA"),
     "second": (1e-6, "µs"),
     "siemens second^alpha": (1e-9, "nS·s^alpha"),
+    "ohm second^-1/2": (1e3, "kΩ·s^-1/2"),
+    "second ohm^(1/alpha)": (1e-6, "µs·Ω^(1/alpha)"),
     "1": (1.0, ""),
 }
 
@@ -28,6 +30,9 @@ SYMBOLS = {
     "ampere": "A",
     "volt": "V",
     "hertz": "Hz",
+    "siemens second^alpha": "S·s^alpha",
+    "ohm second^-1/2": "Ω·s^-1/2",
+    "second ohm^(1/alpha)": "s·Ω^(1/alpha)",
 }
 PREFIXES = {
     -15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"

@@ -1,4 +1,4 @@
-"""The elements: resistor, capacitor, inductor, constant-phase element and diffusion.
+"""The elements: resistor, capacitor, inductors, relaxation and constant-phase element.
 
 SPICE has no constant-phase element. Its impedance is an integral over relaxations with all corner
 frequencies x [rad/s] (substitute x = s y to verify):
@@ -19,7 +19,6 @@ replaces all faster relaxations. Both values are sums of geometric series.
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -55,14 +54,10 @@ PseudoCapacitance = Quantity
 # A ladder in time is exact from SLOWEST/N to FASTEST, times the sample rate, for N samples [rad].
 SLOWEST, FASTEST = 0.3, 10.0
 STEP = 0.95  # step h of ln x; the relative error of the trapezoidal rule is then 6e-5
-# s τ of a diffusion that stands for 0, and relaxations of its netlist for each √(ωτ): the resistor
-# of the others then misses 5e-5 of |Z|.
-LEAST, NEGLECTED = 1e-10, 5.2
-EXACT, GROUP = 12, 0.7  # slow relaxations of a diffusion that are exact; of ln x for the others
 BEYOND = np.log(600.0)  # margin of ln x beyond the band: the ends are exact to first order only
 
 
-def _beside(s: Complex[AnyArray, "..."], value: Quantity) -> Complex[AnyArray, "..."]:
+def beside(s: Complex[AnyArray, "..."], value: Quantity) -> Complex[AnyArray, "..."]:
     """A field of an element as complex numbers, in the namespace of both."""
     return as_complex(namespace(s, value).asarray(value))
 
@@ -75,7 +70,7 @@ class Resistance(AbstractRational):
 
     def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
-        return _wide(_beside(s, self.r), s)
+        return _wide(beside(s, self.r), s)
 
     def admittance(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Admittance 1/Z [S]."""
@@ -83,7 +78,7 @@ class Resistance(AbstractRational):
 
     def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
         """Impedance and its slope, as numbers that broadcast with s."""
-        r = _beside(s, self.r)
+        r = beside(s, self.r)
         return r, [r]
 
     def admittance_slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
@@ -92,7 +87,7 @@ class Resistance(AbstractRational):
         return y, [-y]
 
     def _inverse(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
-        return _beside(s, 1 / namespace(s, self.r).asarray(self.r))
+        return beside(s, 1 / namespace(s, self.r).asarray(self.r))
 
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
@@ -115,7 +110,7 @@ class Capacitance(AbstractRational):
 
     def admittance(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Admittance 1/Z [S]."""
-        return s * _beside(s, self.c)
+        return s * beside(s, self.c)
 
     def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
         """Impedance and its slope."""
@@ -144,7 +139,7 @@ class Inductance(AbstractRational):
 
     def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
-        return s * _beside(s, self.inductance)
+        return s * beside(s, self.inductance)
 
     def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
         """Impedance and its slope."""
@@ -160,6 +155,67 @@ class Inductance(AbstractRational):
         netlist.part("L", self.inductance, plus, minus)
 
 
+class ModifiedInductance(AbstractIrrational):
+    """A modified inductance, Z = (s L)^α, whose phase is 90° α at every frequency.
+
+    Source: `La` of impedance.py 1.7. Its docstring has L (jω)^α, its code (L jω)^α, as here.
+    """
+
+    symbol: ClassVar[str] = "La"
+    inductance: Quantity
+    alpha: Exponent
+
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
+        """Impedance [Ω], with the branch that is real for s > 0."""
+        return namespace(s, self.alpha).exp(self._log(s))
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance, and its slopes α Z and Z ln Z."""
+        log = self._log(s)
+        z = namespace(s, self.alpha).exp(log)
+        return z, [beside(s, self.alpha) * z, z * log]
+
+    def _log(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
+        """α ln (s L)."""
+        xp = namespace(s, self.inductance, self.alpha)
+        return beside(s, self.alpha) * xp.log(s * beside(s, self.inductance))
+
+    def exponents(self) -> tuple[Exponent, ...]:
+        """Exponent α."""
+        return (self.alpha,)
+
+
+class Relaxation(AbstractRational):
+    """A resistor parallel to a capacitor of C = τ / R, Z = R / (1 + s τ).
+
+    Source: `K` of impedance.py, an element of the linear Kramers-Kronig test (Boukamp 1995).
+    """
+
+    symbol: ClassVar[str] = "K"
+    r: Ohm
+    tau: Second
+
+    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
+        """Impedance [Ω]."""
+        return beside(s, self.r) * reciprocal(beside(s, 1.0) + s * beside(s, self.tau))
+
+    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
+        """Impedance, and its slopes Z and −Z s τ / (1 + s τ)."""
+        x = s * beside(s, self.tau)
+        share = reciprocal(beside(s, 1.0) + x)
+        z = beside(s, self.r) * share
+        return z, [z, -z * x * share]
+
+    def rational(self) -> Rational:
+        """Impedance [Ω] as a ratio of polynomials in s."""
+        xp = namespace(self.r, self.tau)
+        return Rational(xp.asarray(self.r)[None], xp.append(1.0, self.tau))
+
+    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
+        """Write the resistor and the capacitor into the netlist."""
+        parallel(resistor(self.r), capacitor(self.tau / self.r)).connect(netlist, plus, minus)
+
+
 class ConstantPhase(AbstractIrrational):
     """A constant-phase element, Z = 1 / (Q s^α), whose phase is −90° α at every frequency."""
 
@@ -173,7 +229,7 @@ class ConstantPhase(AbstractIrrational):
 
     def admittance(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Admittance 1/Z [S], with the branch of s^α that is real for s > 0."""
-        return _beside(s, self.q) * namespace(s, self.alpha).exp(self._log_power(s))
+        return beside(s, self.q) * namespace(s, self.alpha).exp(self._log_power(s))
 
     def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
         """Impedance and its slopes."""
@@ -182,7 +238,7 @@ class ConstantPhase(AbstractIrrational):
     def admittance_slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
         """Admittance and its slopes."""
         log_power = self._log_power(s)
-        y = _beside(s, self.q) * namespace(s, self.alpha).exp(log_power)
+        y = beside(s, self.q) * namespace(s, self.alpha).exp(log_power)
         return y, [y, y * log_power]
 
     def _log_power(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
@@ -223,75 +279,6 @@ class ConstantPhase(AbstractIrrational):
         ladder(float(self.q), float(self.alpha), netlist.band).connect(netlist, plus, minus)
 
 
-class Diffusion(AbstractIrrational):
-    """Diffusion through a layer (finite Warburg), Z = R tanh √(sτ) / √(sτ).
-
-    Its relaxations are, with the poles of the hyperbolic tangent (Mittag-Leffler),
-
-        Z = Σ R_k / (1 + s τ / x_k),   R_k = 2 R / x_k,   x_k = (k − ½)² π²,   k = 1, 2, …
-    """
-
-    symbol: ClassVar[str] = "Ws"
-    r: Ohm
-    tau: Second
-
-    def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
-        """Impedance [Ω]."""
-        root, gone = self._root(s)
-        one = _beside(s, 1.0)
-        return _beside(s, self.r) * (one - gone) * reciprocal(root * (one + gone))
-
-    def slopes(self, s: Complex[AnyArray, "..."]) -> Slopes:
-        """Impedance, and its slopes Z and (R / cosh² √(sτ) − Z) / 2."""
-        root, gone = self._root(s)
-        one, r = _beside(s, 1.0), _beside(s, self.r)
-        near = reciprocal(one + gone)
-        z = r * (one - gone) * near * reciprocal(root)
-        return z, [z, _beside(s, 2.0) * r * gone * near * near - _beside(s, 0.5) * z]
-
-    def _root(
-        self, s: Complex[AnyArray, "..."]
-    ) -> tuple[Complex[AnyArray, "..."], Complex[AnyArray, "..."]]:
-        """√(sτ) and e^(−2 √(sτ)); the real part of the root is positive."""
-        xp, tau = namespace(s, self.tau), _beside(s, self.tau)
-        x = s * tau
-        x = xp.where(x == 0, xp.full_like(tau, LEAST), x)
-        root = xp.exp(_beside(s, 0.5) * xp.log(x)) if xp is jnp else xp.sqrt(x)
-        return root, xp.exp(_beside(s, -2.0) * root)
-
-    def exponents(self) -> tuple[Exponent, ...]:
-        """Empty: no exponent of it can exceed that of a passive element."""
-        return ()
-
-    def state_space(self, rate: float | Float[AnyArray, ""], samples: int) -> StateSpace:
-        """Its relaxations, for every τ up to the length of the record.
-
-        Their states are scaled as in `ConstantPhase`. The slow ones are exact. Of the others, two
-        stand for each `GROUP` of ln x.
-        """
-        x, weight = _relaxations(samples)
-        xp = namespace(self.r, self.tau, rate)
-        r, tau = xp.asarray(self.r), xp.asarray(self.tau)
-        unit = r / (rate * xp.sqrt(rate * tau))  # |Z| at the sample rate, divided by it [Ω s]
-        rises = r * (weight * x) / tau
-        return StateSpace(
-            xp.diag(-x / tau),
-            xp.sqrt(rises / unit)[:, None],
-            xp.sqrt(rises * unit),
-            xp.asarray(r * (1 - weight.sum()))[None],
-        )
-
-    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
-        """Write its relaxations up to those that are far above the band, and the rest's sum."""
-        r, tau, high = float(self.r), float(self.tau), 2 * np.pi * netlist.band[1]
-        netlist.remarks.add(
-            f"diffusion as RC pairs, error below 0.01 % up to {netlist.band[1]:g} Hz"
-        )
-        x = _poles(high * tau)
-        pairs = [parallel(resistor(2 * r / one), capacitor(tau / (2 * r))) for one in x]
-        series(resistor(r - float(np.sum(2 * r / x))), *pairs).connect(netlist, plus, minus)
-
-
 def _of_first_order(value: Quantity) -> Float[AnyArray, "2"]:
     """The polynomial value · s."""
     xp = namespace(value)
@@ -302,37 +289,6 @@ def _of_first_order(value: Quantity) -> Float[AnyArray, "2"]:
 def _wide(z: Complex[AnyArray, "..."], s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
     """Numbers that do not depend on s, for every s."""
     return namespace(s, z).broadcast_to(z, np.broadcast_shapes(z.shape, s.shape))
-
-
-def _poles(highest: float) -> Float[np.ndarray, " n"]:
-    """x_k of the relaxations that count up to this ωτ."""
-    count = int(np.ceil(NEGLECTED * np.sqrt(1 + highest)))
-    return (np.arange(count) + 0.5) ** 2 * np.pi**2
-
-
-def _relaxations(samples: int) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Frequencies x and shares of R of relaxations that replace a diffusion in a record."""
-    x = _poles(FASTEST * samples)
-    share = 2 / x
-    found = [(x[:EXACT], share[:EXACT])]
-    edges = np.exp(np.arange(np.log(x[EXACT]), np.log(x[-1]) + GROUP, GROUP))
-    for low, high in zip(edges, np.append(edges[1:], np.inf), strict=True):
-        part = (x >= low) & (x < high)
-        if not part.any():
-            continue
-        # Gauss' rule with two nodes, for the sum over these relaxations as a function of ln x.
-        w, u = share[part], np.log(x[part])
-        whole, mean = w.sum(), np.average(u, weights=w)
-        spread = np.average((u - mean) ** 2, weights=w)
-        if spread == 0:
-            found.append((x[part][:1], w[:1]))
-            continue
-        skew = np.average((u - mean) ** 3, weights=w) / spread
-        root = np.sqrt(skew**2 + 4 * spread)
-        nodes = np.array([skew - root, skew + root]) / 2
-        found.append((np.exp(mean + nodes), whole * np.array([nodes[1], -nodes[0]]) / root))
-    places, shares = zip(*found, strict=True)
-    return np.concatenate(places), np.concatenate(shares)
 
 
 def _corners(low: float, high: float) -> Float[np.ndarray, " n"]:
@@ -402,16 +358,6 @@ def constant_phase(q: PseudoCapacitance, alpha: Exponent) -> ConstantPhase:
         alpha: α, above 0 and at most 1.
     """
     return ConstantPhase(q, alpha)
-
-
-def diffusion(r: Ohm, tau: Second) -> Diffusion:
-    """Diffusion through a layer, Z = R tanh √(sτ) / √(sτ); impedance.py calls it `Ws`.
-
-    Args:
-        r: R [Ω], the impedance at low frequency.
-        tau: τ [s]; far above 1/(2πτ) the phase is −45°.
-    """
-    return Diffusion(r, tau)
 
 
 def cole(r: Ohm, tau: Second, alpha: Exponent) -> Parallel:

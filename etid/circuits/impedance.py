@@ -223,6 +223,12 @@ class AbstractIrrational(AbstractElement):
         del rate, samples
         raise ValueError(f"{type(self).__name__} has no known response in time")
 
+    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
+        """Raise ValueError; an element with a ladder of resistors and capacitors replaces it."""
+        raise ValueError(
+            f"{type(self).__name__} cannot be written as resistors, capacitors and inductors"
+        )
+
 
 class AbstractConnection(AbstractImpedance):
     """A connection of several impedances, a node of the tree.

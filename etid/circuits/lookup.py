@@ -6,9 +6,10 @@ may also be named by a string in the notation of impedance.py, such as `R0-p(R1,
 
     circuit = part {"-" part}                    series
     part    = element | "p(" circuit {"," circuit} ")"     parallel
-    element = "R" number | "C" number | "L" number | "CPE" number
+    element = ("R" | "C" | "L" | "CPE" | "W" | "Wo" | "Ws" | "G" | "La" | "K" | "T") ["_"] number
 
-The parameters are `r_0`, `c_1`, `l_3`, and `q_2` and `alpha_2` of `CPE2`.
+The parameters are `r_0`, `c_1`, `l_3`, `w_4`, and `q_2` and `alpha_2` of `CPE2`. Those of other
+elements have its name, such as `r_wo1` and `tau_wo1` of `Wo1`.
 """
 
 import difflib
@@ -22,16 +23,49 @@ from typing import Any, ClassVar, NoReturn
 from etid.circuits import circuit as circuits
 from etid.circuits.circuit import AbstractCircuit, parameter
 from etid.circuits.current_dependent import SkinCurrent
-from etid.circuits.elements import capacitor, constant_phase, inductor, resistor
+from etid.circuits.diffusion import Diffusion, FiniteSpace, Gerischer, PorousElectrode, Warburg
+from etid.circuits.elements import (
+    ModifiedInductance,
+    Relaxation,
+    capacitor,
+    constant_phase,
+    inductor,
+    resistor,
+)
 from etid.circuits.impedance import AbstractImpedance, parallel, series
 
 STRINGS = "circuit strings"  # module of their classes, whose compiled programs are not stored
-_ELEMENTS: dict[str, tuple[Callable[..., AbstractImpedance], dict[str, str]]] = {
-    "R": (resistor, {"r": "ohm"}),
-    "C": (capacitor, {"c": "farad"}),
-    "L": (inductor, {"l": "henry"}),
-    "CPE": (constant_phase, {"q": "siemens second^alpha", "alpha": "1"}),
+# Elements by symbol: unit and typical value of each parameter, whose name ends in a number. The
+# values of R, C and K are those of `SkinRC`. Diffusion has its |Z|, and is ten times as slow.
+_ELEMENTS: dict[str, tuple[Callable[..., AbstractImpedance], dict[str, tuple[str, float]]]] = {
+    "R": (resistor, {"r_": ("ohm", 20e3)}),
+    "C": (capacitor, {"c_": ("farad", 0.3e-9)}),
+    "L": (inductor, {"l_": ("henry", 1e-3)}),
+    "CPE": (constant_phase, {"q_": ("siemens second^alpha", 2e-9), "alpha_": ("1", 0.8)}),
+    "W": (Warburg, {"w_": ("ohm second^-1/2", 10e6)}),
+    "Wo": (FiniteSpace, {"r_wo": ("ohm", 100e3), "tau_wo": ("second", 300e-6)}),
+    "Ws": (Diffusion, {"r_ws": ("ohm", 100e3), "tau_ws": ("second", 300e-6)}),
+    "G": (Gerischer, {"r_g": ("ohm", 100e3), "tau_g": ("second", 300e-6)}),
+    "La": (
+        ModifiedInductance,
+        {"l_la": ("second ohm^(1/alpha)", 1e-3), "alpha_la": ("1", 0.8)},
+    ),
+    "K": (Relaxation, {"r_k": ("ohm", 100e3), "tau_k": ("second", 30e-6)}),
+    "T": (
+        PorousElectrode,
+        {
+            "r_a_t": ("ohm", 100e3),
+            "r_b_t": ("ohm", 50e3),
+            "reaction_t": ("1", 1.0),
+            "tau_t": ("second", 300e-6),
+        },
+    ),
 }
+NESTED = 100  # a string of a file must not exceed Python's stack
+_SYMBOL = "|".join(sorted(_ELEMENTS, reverse=True))  # "Wo" before "W"
+_TOKEN = re.compile(rf"(p)\(|({_SYMBOL})(\d+)", re.ASCII)
+_SLOW = ("farad", "siemens second^alpha", "second")  # proportional to a time constant
+_STRING = re.compile(rf"[p(),-]*(?:(?:{_SYMBOL})_?\d+[p(),-]*)+", re.ASCII)
 # An element of a string, from its kind, its number, and whether it is in a parallel connection.
 _Element = Callable[[str, str, bool], AbstractImpedance]
 
@@ -147,12 +181,14 @@ def circuit(string: str) -> AbstractCircuit:
     """A circuit from a string in the notation of impedance.py, such as `R0-p(R1,C1)`.
 
     Args:
-        string: Elements `R0`, `C1`, `L3` and `CPE2`, joined by `-` in series and by `p(…,…)` in
-            parallel.
+        string: Elements with a number, such as `R0`, `C_1` or `CPE2`, joined by `-` in series and
+            by `p(…,…)` in parallel: R, C, L, CPE, W, Wo, Ws, G, La, K and T of impedance.py.
 
     Returns:
-        The circuit with typical values. Its parameters are `r_0`, `c_1`, `l_3`, and `q_2` and
-        `alpha_2` of `CPE2`. Equal strings give circuits of one class.
+        The circuit with typical values. Its parameters are `r_0`, `c_1`, `l_3`, `w_4`, `q_2` and
+        `alpha_2` of `CPE2`, `r_wo1` and `tau_wo1` of `Wo1`, as of `Ws`, `G` and `K`, `l_la1` and
+        `alpha_la1` of `La1`, and `r_a_t1`, `r_b_t1`, `reaction_t1` and `tau_t1` of `T1`, which are
+        its A, B, a and b. Equal strings give circuits of one class.
 
     Raises:
         ValueError: The string is not a circuit, or an element occurs twice.
@@ -166,12 +202,13 @@ def circuit(string: str) -> AbstractCircuit:
 
 def is_circuit_string(name: str) -> bool:
     """Whether a text can only be a circuit string."""
-    return bool(re.fullmatch(r"[RCLPEp(),-]*\d[RCLPEp(),\d-]*", name))
+    return _STRING.fullmatch(name) is not None
 
 
 def class_of(string: str) -> type[AbstractCircuit]:
     """The class of the circuits of a string; ValueError as `circuit`."""
-    return _class_of("".join(string.split()))
+    spaceless = "".join(string.split())
+    return _class_of(re.sub(rf"({_SYMBOL})_(?=\d)", r"\1", spaceless, flags=re.ASCII))
 
 
 @functools.cache
@@ -179,20 +216,23 @@ def _class_of(string: str) -> type[AbstractCircuit]:
     fields: dict[str, Any] = {}
 
     def declared(kind: str, number: str, within: bool) -> AbstractImpedance:
-        """Add the parameters of an element; their typical values are those of `SkinRC`."""
-        make, units = _ELEMENTS[kind]
-        if f"{next(iter(units))}_{number}" in fields:
+        """Add the parameters of an element, with their typical values."""
+        make, parameters = _ELEMENTS[kind]
+        if f"{next(iter(parameters))}{number}" in fields:
             raise ValueError(
                 f"{string!r} has {kind}{number} twice; give each element its own number"
             )
-        # Later capacitances are larger, as in `SkinLayers`.
-        larger = 10.0 ** sum(name[0] in "cq" for name in fields)
-        typical = {"r": 100e3 if within else 20e3, "c": 0.3e-9 * larger, "l": 1e-3,
-                   "q": 2e-9 * larger, "alpha": 0.8}  # fmt: skip
-        for name, unit in units.items():
-            fields[f"{name}_{number}"] = parameter(unit, typical=typical[name])
-        return make(*(typical[name] for name in units))
+        # Later elements are slower, as in `SkinLayers`, and resistors within larger.
+        larger = 10.0 ** sum(field.metadata["unit"] in _SLOW for field in fields.values())
+        values = []
+        for name, (unit, typical) in parameters.items():
+            factor = larger if unit in _SLOW else 5.0 if kind == "R" and within else 1.0
+            fields[f"{name}{number}"] = parameter(unit, typical=typical * factor)
+            values.append(typical * factor)
+        return make(*values)
 
+    if string.count("(") > NESTED:
+        raise ValueError(f"a circuit of more than {NESTED} parallel connections cannot be read")
     _, end = _series(string, 0, declared)
     if end != len(string):
         _refuse(string, end)
@@ -201,8 +241,8 @@ def _class_of(string: str) -> type[AbstractCircuit]:
         """Impedance of the string."""
 
         def element(kind: str, number: str, _: bool) -> AbstractImpedance:
-            make, units = _ELEMENTS[kind]
-            return make(*(getattr(self, f"{name}_{number}") for name in units))
+            make, parameters = _ELEMENTS[kind]
+            return make(*(getattr(self, f"{name}{number}") for name in parameters))
 
         return _series(string, 0, element)[0]
 
@@ -228,14 +268,15 @@ def _blank(string: str) -> AbstractCircuit:
 
 
 def _refuse(string: str, at: int) -> NoReturn:
-    kind = re.compile("|".join(sorted(_ELEMENTS, reverse=True))).match(string, at)
+    kind = re.compile(_SYMBOL).match(string, at)
     rest = string[at:] if kind is None else string[kind.end() :]
     cause = f"cannot read {rest!r}" if rest else "it ends too early"
     if kind is not None:
         cause += f", where the number of {kind[0]} must be"
+    *known, last = _ELEMENTS
     raise ValueError(
-        f"{string!r} is no circuit: {cause}; write R, C, L or CPE with a number, '-' for series "
-        "and 'p(…,…)' for parallel, as in 'R0-p(R1,C1)'"
+        f"{string!r} is no circuit: {cause}; write {', '.join(known)} or {last} with a number, '-' "
+        "for series and 'p(…,…)' for parallel, as in 'R0-p(R1,C1)'"
     )
 
 
@@ -245,7 +286,7 @@ def _series(
     """Impedance of the parts from this place on, and the place after them."""
     parts = []
     while True:
-        token = re.compile(r"(p)\(|(CPE|R|C|L)(\d+)").match(string, at)
+        token = _TOKEN.match(string, at)
         if token is None:
             _refuse(string, at)
         if token[1]:

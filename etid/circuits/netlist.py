@@ -16,8 +16,9 @@ def netlist(
 ) -> str:
     """SPICE subcircuit of resistors, capacitors and inductors between the nodes `plus` and `minus`.
 
-    A chain of RC pairs replaces a constant-phase element. Its relative error in `band` is at most
-    1e-4. A line such as `X1 out 0 load` connects the subcircuit.
+    A chain of RC pairs replaces a constant-phase element, and diffusion (W, Wo, Ws and G of circuit
+    strings). Its relative error in `band` is at most 1e-4. A line such as `X1 out 0 load` connects
+    the subcircuit.
 
     Args:
         circuit: One circuit, such as `fit.circuit`.
@@ -29,7 +30,8 @@ def netlist(
 
     Raises:
         ValueError: The name or the band is invalid, the circuit is a batch, an element is not a
-            positive number, or an exponent is above 1.
+            positive number, an exponent is above 1, or an element is no network of such parts (La
+            and T).
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, flags=re.ASCII):
         raise ValueError(
@@ -53,8 +55,8 @@ def circuit_string(circuit: AbstractCircuit) -> tuple[str, list[float]]:
 
         CustomCircuit(string, initial_guess=values)
 
-    The values have the order of the elements in the string. A `CPE` has two values: Q [S s^α] and
-    α.
+    The values have the order of the elements in the string, and those of an element the order of
+    impedance.py. A `CPE` has two values: Q [S s^α] and α.
 
     Args:
         circuit: One circuit, such as `fit.circuit`.
