@@ -195,7 +195,7 @@ def bounds() -> dict[str, etid.Bound]:
     """Of a dry trial at 60 dB, and one whose capacitance is not determined."""
     one = etid.bound(PRESETS["paper_dry"](snr_db=60.0))["typical/dry/01"]
     noisy = np.diag(np.square([0.4, 0.02, 3.0]))
-    return {"dry": one, "noisy": dataclasses.replace(one, path="noisy/01", cov=noisy)}
+    return {"dry": one, "noisy": dataclasses.replace(one, path="noisy/01", log_cov=noisy)}
 
 
 def dry() -> etid.Recording:
@@ -353,6 +353,8 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "fits": lambda: figure_of(fits()),
     "posterior": lambda: figure_of(posterior()),
     "profile": lambda: figure_of(profile()),
+    "residual": lambda: figure_of(fit().residual(dry(), driver())),
+    "residual_of_impedance": lambda: figure_of(measured().residual()),
     "bound": lambda: figure_of(bounds()),
     "map": lambda: figure_of(display(), map="r_p"),
     "selection_without_elements": lambda: figure_of(nothing_found(), spread(), driver()),

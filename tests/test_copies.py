@@ -78,6 +78,8 @@ def objects():
         etid.StudyFits(fits, {("calibration/98k8",): driver}, {}),
         fit.budget(),
         fit.posterior(draws=100),
+        fit.residual(),
+        etid.compare(fit, recording),
         etid.Profile("r_s", "ohm", 2e4, 1e2, np.arange(3.0), np.arange(3.0)),
         selection,
         *selection.candidates,

@@ -18,6 +18,7 @@ from etid.results.driver import Driver, SourceImpedance
 from etid.results.fit import Fit
 from etid.results.fits import Fits
 from etid.results.posterior import Posterior, Profile
+from etid.results.residual import Residual
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
 
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
     from etid.plotting.layout import Layout
     from etid.plotting.style import Canvas
 
-    One = Recording | MeasuredImpedance | Fits | Selection | Posterior | Profile | Bound | Impedance
+    Seen = Recording | MeasuredImpedance | Posterior | Profile | Residual | Bound
+    One = Seen | Fits | Selection | Impedance
     Drawable = One | Mapping[str, Bound] | Mapping[str, Impedance]
 else:
     Drawable = Any
@@ -68,6 +70,8 @@ def plot(
     | `plot({label: driver, fit or circuit})` | several of these in one diagram | 2 |
     | `plot(posterior)` | each element, and each two of them, beside the errors of the fit | n² |
     | `plot(profile)` | how much worse the fit becomes if one element has another value | 1 |
+    | `plot(residual)` | residual [mV], its size by frequency, its correlations by lag | 4 |
+    | `plot(residual)` of `identify_impedance` | size by frequency, correlation of neighbours | 2 |
     | `plot(fits)` | each element by subject, conditions side by side | one per element |
     | `plot(fits, by=("session", "subject"))` | each element by two other labels | the same |
     | `plot(fits, map="r_p")` | an element at each electrode of a display | one per group |
@@ -87,6 +91,10 @@ def plot(
     standard errors. `show="residual"` adds the autocorrelation of the residual and its
     cross-correlation with V_th; of white noise, 99 % lie in the band. Aliases of the edges
     exceed it, too.
+
+    `plot(fit.residual())` draws what a fit leaves relative to the noise that it expects, so that
+    aliases and the colour of noise do not matter: 95 % of the bands of frequency and 99 % of the
+    lags of such noise lie in the grey bands.
 
     The picture of a selection shows magnitude [kΩ] and phase [deg] in bands of frequency with two
     standard errors; points are pale where the error exceeds 30 %. Below are the deviations of each
@@ -155,7 +163,7 @@ def _draw(
 ) -> np.ndarray:
     import matplotlib as mpl
 
-    from etid.plotting import elements, impedances, judging, maps, pulses, style
+    from etid.plotting import elements, impedances, judging, maps, pulses, residuals, style
     from etid.plotting.layout import FINGERTIP, Layout, read_layout
 
     if show not in get_args(Shown) or (show != "pulse" and not isinstance(x, Fit)):
@@ -218,6 +226,8 @@ def _draw(
                 return elements.draw_posterior(canvas, x)
             case Profile(), None, None:
                 return elements.draw_profile(canvas, x)
+            case Residual(), None, None:
+                return residuals.draw_residual(canvas, x)
             case Bound(), None, None:
                 return elements.draw_bounds(canvas, [x])
             case ((Driver() | SourceImpedance() | AbstractCircuit()), None, None):
@@ -231,8 +241,8 @@ def _draw(
     raise TypeError(
         f"cannot draw {given}; plot takes a Recording, a Fit or Selection "
         "with its recording and driver, a Driver alone or with a calibration, a circuit, Fits, a "
-        "Posterior, a Profile, a Bound, a dictionary of bounds, or a dictionary of drivers, fits "
-        "and circuits"
+        "Posterior, a Profile, a Residual, a Bound, a dictionary of bounds, or a dictionary of "
+        "drivers, fits and circuits"
     )
 
 

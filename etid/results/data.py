@@ -24,6 +24,8 @@ from etid.results.posterior import Posterior, Profile
 if TYPE_CHECKING:
     import matplotlib.axes
 
+    from etid.results.residual import Residual
+
 Shown = Literal["pulse", "impedance", "residual"]
 AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
 Size = tuple[float, float] | None  # width and height [inch]
@@ -34,6 +36,11 @@ def _of_higher_layer(module: str, name: str) -> Callable[..., Any]:
     return getattr(importlib.import_module(module), name)
 
 
+def drawn(x: Any, **options: Any) -> Any:
+    """`etid.plot` of an object."""
+    return _of_higher_layer("etid.plotting", "plot")(x, **options)
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class MeasuredImpedance(Overviewed):
     """An impedance as an instrument measured it.
@@ -42,11 +49,15 @@ class MeasuredImpedance(Overviewed):
         frequency: Frequencies [Hz].
         z: Impedance [Ω].
         stderr: Standard errors of the real and of the imaginary part [Ω]; None if not known.
+        known: Elements that were known before its fit: name, value and standard deviation [SI].
+        bounds: Elements with bounds in its fit: name, lower and upper bound [SI].
     """
 
     frequency: Float[np.ndarray, " frequency"]
     z: Complex[np.ndarray, " frequency"]
     stderr: Float[np.ndarray, " frequency"] | None
+    known: tuple[tuple[str, float, float], ...] = ()
+    bounds: tuple[tuple[str, float, float], ...] = ()
 
     def _overview(self) -> Overview:
         errors = [""] * self.z.size
@@ -61,7 +72,6 @@ class MeasuredImpedance(Overviewed):
 
     def plot(self, *, axes: AnyAxes = None, size: Size = None, title: str | None = "") -> Any:
         """Draw the points; the same as `etid.plot(spectrum)`, with its arguments."""
-        drawn = _of_higher_layer("etid.plotting", "plot")
         return drawn(self, axes=axes, size=size, title=title)
 
 
@@ -135,6 +145,41 @@ class HasSource(Generic[Circuit]):
         """
         drawn = _of_higher_layer("etid.plotting", "plot")
         return drawn(self, recording, driver, show=show, axes=axes, size=size, title=title)
+
+    def residual(
+        self, recording: Recording | None = None, driver: Driver | None = None
+    ) -> "Residual":
+        """What the fit leaves of its recording, and whether it is noise.
+
+        The elements are those of the fit; Z_th and the trigger delay follow the recording within
+        what is known of them, as in the fit.
+
+        Args:
+            recording: As in `plot`; another one of the same load tests the fit.
+            driver: As in `plot`.
+
+        Returns:
+            The residual in time and by frequency, and its correlations; `print` says whether
+            something is left. Of a fit of `identify_impedance` it is that of Z by frequency.
+
+        Raises:
+            ValueError: The recording is not known or the fit does not allow it, the fit is a batch
+                or has no elements, or the driver has no continuous source impedance.
+        """
+        return _of_higher_layer("etid.identify.residual", "residual")(self, recording, driver)
+
+    def report(self) -> str:
+        """The fit as text: more than `print` shows, as MATLAB's `present`.
+
+        Returns:
+            The circuit with its formula; elements, standard errors, 95 % intervals and correlation
+            coefficients; quality, method and verdict with its message; the numbers of data and
+            elements with AIC and BIC; path and labels of the recording.
+
+        Raises:
+            ValueError: This is a batch.
+        """
+        return _of_higher_layer("etid.results.presented", "report")(self)
 
     def posterior(
         self,

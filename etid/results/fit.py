@@ -23,6 +23,7 @@ from etid.results.data import HasSource
 from etid.results.instrument import Effects, largest
 from etid.results.method_options import without_known
 from etid.results.posterior import tails
+from etid.results.presented import Presented
 from etid.results.verdicts import RESULTS, Judged, counted, leaving, message
 from etid.signals.transfer import AnyArray, power
 
@@ -195,7 +196,7 @@ def _signed(value: float) -> str:
     return ("+" if value >= 0 else "") + rounded(value)
 
 
-class Fit(Judged, HasSource[Circuit]):
+class Fit(Judged, Presented, HasSource[Circuit]):
     """One identified circuit, or a batch of them along a leading axis.
 
     Attributes:
