@@ -17,7 +17,7 @@ NAMES = (
     *("speed", "curves", "scale", "amplitudes", "amplitude_errors", "online", "control"),
     *("speed_accuracy", "which", "paper", "failure_map", "perturbations", "spectra", "rivals"),
     *("referee", "fuzz", "mutation", "live", "instruments", "directions", "inexact", "real"),
-    "excitations",
+    *("excitations", "spectrum_peers"),
 )
 PLACES = {"rivals": "rivals.table"}  # modules of other names
 

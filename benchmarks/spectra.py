@@ -6,6 +6,9 @@ white noise of 0.1 to 3 % of |Z|; good ones have 20, 61 and 100. A fit that is c
 spectrum is none (the sign of Im Z is wrong, or the phase is missing). Of a circuit that is fitted
 to another one, the elements that both have are compared. An element that drifts during the sweep
 has every value that it passes.
+
+Circuit strings have drawn values, which their spectra may not determine: at 60 frequencies from 0.1
+Hz to 1 MHz, with noise of 0.3 %.
 """
 
 import argparse
@@ -20,9 +23,10 @@ import etid
 from benchmarks.coverage import SILENT
 from benchmarks.rates import COVERED, NORMAL_95, clopper_pearson
 from benchmarks.runner import Target, at_most, option, report
+from etid.circuits.branches import in_order
 from etid.results.verdicts import counted
 
-POINTS = 61  # one shape for all faults: a program is compiled for each
+POINTS = 61
 GOOD_POINTS = (20, POINTS, 100)
 NOISE = (1e-3, 3e-2)  # of |Z|, in the real and in the imaginary part
 NOTICED = 0.02  # relative error of an element that counts
@@ -32,6 +36,21 @@ TARGETS = {
     "covered": COVERED,
 }
 ACCEPTED = ("successful", "insensitive")  # layers that noise hides are not determined
+STRINGS = (
+    "R0-p(R1,C1)-Wo1",
+    "R0-p(R1,C1)-Ws1",
+    "R0-p(CPE1,R1-W1)",
+    "R0-p(R1-W1,C1)",
+    "L0-R0-p(R1-Wo1,CPE1)",
+    "La0-R0-p(R1,CPE1)",
+    "R0-G1",
+    "R0-T1",
+    "R0-p(R1,CPE1)-p(R2,CPE2)",
+    "R0-p(CPE1,R1-p(R2,CPE2))",
+    "R0-p(R1,C1)-p(R2,C2)-p(R3,C3)",
+    "R0-p(R1,C1)-p(R2-Wo1,C2)",
+    "p(C1,R1-p(CPE1,R2-Ws1))",
+)
 LAYERS = ("r_1", "c_1", "c_2", "r_2")  # the other way round are those of the other one
 
 
@@ -207,7 +226,8 @@ def answer(of: Spectrum) -> Answer:
     value = np.array([found[name] for name in names.values()])
     stderr = np.array([float(getattr(fit.stderr, name)) for name in names.values()])
     right = np.clip(value, *np.reshape([of.truth[name] for name in names], (-1, 2)).T)
-    z, relative = (value - right) / stderr, (value - right) / right
+    with np.errstate(divide="ignore", invalid="ignore"):  # an element of 0 has no error
+        z, relative = (value - right) / stderr, (value - right) / right
     wrong = ((np.abs(z) > SILENT) & (np.abs(relative) > NOTICED)).any() or not names
     return Answer(fit.verdict, z, fit.usable and bool(wrong))
 
@@ -215,6 +235,7 @@ def answer(of: Spectrum) -> Answer:
 OPTIONS = (
     option("--spectra", default=300, help="of each fault"),
     option("--good", default=1000, help="of each number of frequencies"),
+    option("--drawn", default=60, help="of each circuit string"),
     option("--seed", default=0),
 )
 
@@ -251,6 +272,33 @@ def without_fault(seed: int, spectra: int) -> Iterator[Target]:
             yield Target.of(TARGETS, name, value, of, text=text, interval=scatter)
 
 
+def of_string(string: str, rng: np.random.Generator) -> Spectrum:
+    """A spectrum of a circuit string whose elements are drawn."""
+    typical = etid.circuit(string)
+    level, duration = typical.scaling()
+    logs = np.array(typical.log_values()) + rng.uniform(-9.0, 2.0) * level
+    has_size = (level != 0) | (duration != 0)  # all but exponents
+    logs = np.where(has_size, logs + 1.2 * rng.standard_normal(logs.size), logs)
+    is_exponent = np.array([name.startswith("alpha") for name in typical.names()])
+    values = np.where(is_exponent, rng.uniform(0.6, 0.97, logs.size), np.exp(logs))
+    places = np.asarray(in_order(typical, np.log(values)))
+    circuit, f = type(typical)(*values[places]), np.geomspace(1e6, 0.1, 60)
+    z, parts = circuit.response(f), rng.standard_normal((2, f.size))
+    z = z + 3e-3 * np.abs(z) * (parts[0] + 1j * parts[1])
+    return Spectrum(f, z, typical, exact(circuit))
+
+
+def of_strings(seed: int, spectra: int) -> Iterator[Target]:
+    """Silent answers to spectra of circuit strings."""
+    for number, string in enumerate(STRINGS):
+        seeds = [(seed, len(FAULTS) + number, draw) for draw in range(spectra)]
+        answers = [answer(of_string(string, np.random.default_rng(one))) for one in seeds]
+        wrong, verdicts = sum(one.silent for one in answers), [one.verdict for one in answers]
+        text = f"{wrong} silent; {counted(np.array(verdicts))}"
+        yield Target.of(TARGETS, "silent", wrong, f"{string}: ", text=text)
+
+
 def main(arguments: argparse.Namespace) -> bool:
     of = arguments
-    return report([*with_fault(of.seed, of.spectra), *without_fault(of.seed, of.good)])
+    found = [*with_fault(of.seed, of.spectra), *without_fault(of.seed, of.good)]
+    return report([*found, *of_strings(of.seed, of.drawn)])

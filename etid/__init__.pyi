@@ -34,9 +34,12 @@ from .files.exporting import export_study as export_study
 from .files.folder import import_folder as import_folder
 from .files.importing import import_file as import_file
 from .files.spectra import read_impedance as read_impedance
+from .identify.compare import Comparison as Comparison
+from .identify.compare import compare as compare
 from .identify.driver import identify_driver as identify_driver
 from .identify.file import fit_file as fit_file
 from .identify.impedance import identify_impedance as identify_impedance
+from .identify.impedance import identify_impedances as identify_impedances
 from .identify.jointly import identify_jointly as identify_jointly
 from .identify.kramers_kronig import KramersKronig as KramersKronig
 from .identify.kramers_kronig import kramers_kronig as kramers_kronig
@@ -69,6 +72,7 @@ from .results.instrument import Budget as Budget
 from .results.instrument import Instrument as Instrument
 from .results.posterior import Posterior as Posterior
 from .results.posterior import Profile as Profile
+from .results.residual import Residual as Residual
 from .results.study_fits import StudyFits as StudyFits
 from .results.variation import Variation as Variation
 from .results.variation import variation as variation

@@ -68,7 +68,7 @@ calls = {
     "etid.identify_skin(rec, d, fixed={'r_s': 500.0}, prior={'r_p': 1e5})": "prior['r_p']",
     "etid.identify_skin(rec, d, prior={'r_s': (1e3, 'a'), 'r_p': (1e5, 1e4)})": "prior['r_s']",
     "etid.identify_impedance([1.0, 2.0], [1.0, 1.0], fixed={'r_s': '5k'})": "fixed['r_s']",
-    "etid.identify_skin(rec, d, circuit='R_0-p(R_1,C_1)')": "circuit",
+    "etid.identify_skin(rec, d, circuit='R_0-p(R_1,X_1)')": "circuit",
     "etid.identify_skin(rec, d, circuit='SkinCole')": "circuit",
     "etid.identify_driver([cal, cal])": "calibrations[1]",
     "etid.identify_amplitudes([of_current, of_current])": "recordings[1]",

@@ -93,7 +93,8 @@ CASES = {
         "--quick --workers 1 --folder {}",
         "selection.csv selection_map.csv selection.svg", "spurious element, from 20 dB",
     ),
-    "spectra": ("--spectra 4 --good 6 --seed 1", "", "wrong sign"),
+    "spectra": ("--spectra 4 --good 6 --drawn 1 --seed 1", "", "wrong sign"),
+    "spectrum_peers": ("--draws 1", "", "not installed"),
     "tolerances": (
         "--draws 2 --snr-db 60 --only gain --workers 1", "", "60 dB, gain, joint, damp: covered",
     ),

@@ -75,7 +75,7 @@ def test_errors_of_another_length_are_refused_in_words_of_our_own(shape, given):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_the_advice_of_a_misfit_can_be_followed(known):
-    """It was circuit='auto', which identify_impedance refuses, and order='auto'."""
+    """It was order='auto', and circuit='auto', which chooses from circuits of skin."""
     _, z, stderr = measured()
     errors = stderr if known else None
     fit = etid.identify_impedance(F, z, circuit="R0-p(R1,C1)", throw=False, stderr=errors)
@@ -95,8 +95,3 @@ def test_no_advice_for_a_spectrum_names_what_it_does_not_have(name):
     assert text != message(name)
     for word in ("auto", "method", "period", "v_th", "r_load", "recording"):
         assert word not in text
-
-
-def test_a_choice_of_circuits_is_refused_with_what_to_do():
-    with pytest.raises(ValueError, match="fit each candidate, and compare verdict and chi2"):
-        etid.identify_impedance(F, measured()[1], circuit="auto")

@@ -64,7 +64,7 @@ skin(of, bounds={'r_x': (1.0, 1000.0)}, circuit='auto') -> 'r_x' is no element o
 skin(of, bounds={'r_s': (1.0, 1000.0)}, fixed={'r_s': 5.0}) -> r_s is fixed and has bounds
 skin(of, bounds={'r_s': (1.0, 1000.0)}, method='steiglitz_mcbride')
     -> 'steiglitz_mcbride' takes no known elements and no bounds
-of.impedance.posterior() -> a measured impedance has no draws and no profiles
+of.impedance.budget() -> a measured impedance has no budget
 of.impedance.plot(show='residual') -> no residual in time
 etid.Instrument(gain=-1e-3) -> gain
 etid.Instrument(capacitance=5.0) -> \[F\]
@@ -155,8 +155,7 @@ etid.identify_study(of.study, circuit='R0-p(R1') -> 'R0\-p\(R1' is no circuit: i
 etid.identify_skin(of.skin, circuit='R0-R0') -> has R0 twice
 etid.identify_skins([of.skin], circuit='SkinRC')
     -> circuit: 'SkinRC' is a class of circuits; pass a circuit, as in etid.SkinRC\(\)
-etid.identify_impedance([1.0], [1j], circuit='auto')
-    -> the circuit 'auto' chooses for recordings, not for an impedance
+etid.identify_impedance([1.0], [1j], circuit='auto') -> cannot determine 3 elements
 samples(of, circuit='R0-') -> 'R0\-' is no circuit
 etid.select_circuit(of.skin, candidates=['R0', 'R1']) -> holds R0 and R1, which have the
 [IdentificationError]

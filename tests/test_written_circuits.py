@@ -63,7 +63,7 @@ def test_an_inductor_in_series_has_no_response_in_time_and_one_with_a_resistor_a
 
 
 @pytest.mark.parametrize(
-    "string", ["", "R0-", "R0--C1", "p(R1)", "p(R1,C1", "R0-p(R1,C1))", "W0", "R", "R0 C1", "R0+C1"]
+    "string", ["", "R0-", "R0--C1", "p(R1)", "p(R1,C1", "R0-p(R1,C1))", "X0", "R", "R0 C1", "R0+C1"]
 )
 def test_what_is_no_circuit_is_refused(string):
     with pytest.raises(ValueError, match=r"is no circuit: (cannot read|it ends too early)"):

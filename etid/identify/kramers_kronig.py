@@ -198,7 +198,7 @@ def _fitted(
     s = 2j * np.pi * f
     tau = np.geomspace(1 / s.imag.max(), 1 / s.imag.min(), count)
     columns = [np.ones_like(s), s / s.imag.max(), s.imag.min() / s]
-    model = np.stack([*columns, *(1 / (1 + s * one) for one in tau)], axis=1)
+    model = np.concatenate([np.stack(columns, 1), 1 / (1 + s[:, None] * tau)], axis=1)
     weight = np.tile(1 / sigma, 2)
     rows = np.concatenate([np.real(model), np.imag(model)]) * weight[:, None]
     return model @ np.linalg.lstsq(rows, np.concatenate([np.real(z), np.imag(z)]) * weight)[0]

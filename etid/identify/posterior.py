@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_limits import Limits, of_circuit
-from etid.estimators.element_prior import ElementPrior
+from etid.estimators.element_prior import FIXED, ElementPrior
 from etid.estimators.lanes import Harmonics, taken
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
@@ -36,6 +36,8 @@ from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.fitting import fits_of, is_shared, known_of
+from etid.identify.spectrum import Spectrum, chain_of
+from etid.identify.spectrum_fit import Solved, solved
 from etid.likelihood.approximate import approximated, departs
 from etid.likelihood.search import ROWS, Load, minimum
 from etid.precision import array_function, in_float64, one_thread
@@ -57,7 +59,7 @@ class Known:
     """What is known besides the recording.
 
     Attributes:
-        driver: Distribution of Z_th, or the measured current.
+        driver: Distribution of Z_th, or the measured current; a measured impedance has that of 1 A.
         elements: Prior of the elements; None without one.
         bounds: Bounds of elements.
     """
@@ -74,17 +76,26 @@ class Known:
 
 
 class Minimum(NamedTuple):
-    """The likelihood of a recording, and its minimum.
+    """The likelihood of a recording or of a measured impedance, and its minimum.
 
     Attributes:
-        load: The recording, as one row; its objective is F.
+        load: The recording, as one row, or the impedance; its objective is F.
         q: The minimum.
         cov: H⁻¹.
     """
 
-    load: Load
+    load: Load | Spectrum
     q: Float[np.ndarray, " q"]
     cov: Float[np.ndarray, "q q"]
+
+    @classmethod
+    def of_spectrum(cls, of: Solved) -> "Minimum":
+        """The minimum of a measured impedance, with the noise that the circuit leaves."""
+        spectrum, chi2 = of.least.spectrum, of.least.chi2
+        if spectrum.sigma is None:
+            spectrum = dataclasses.replace(spectrum, noise=spectrum.noise * np.sqrt(chi2))
+        root = inverse_root(spectrum.equations(of.q[None]).matrix[0])
+        return cls(spectrum, of.q, _inverse_curvature(spectrum, of.q, root))
 
     @classmethod
     def of(cls, lane: Harmonics, known: Known, fit: Fit) -> "Minimum":
@@ -104,14 +115,14 @@ class Minimum(NamedTuple):
 
 
 @array_function
-def costs(load: Load, q: Float[np.ndarray, "draw q"]) -> Float[np.ndarray, " draw"]:
+def costs(load: Load | Spectrum, q: Float[np.ndarray, "draw q"]) -> Float[np.ndarray, " draw"]:
     """F of each draw."""
     parts = np.array_split(q, -(-len(q) // ROWS))
     return np.concatenate([load.of(np.zeros(len(of), int)).objective(of) for of in parts])
 
 
 def _inverse_curvature(
-    load: Load, q: Float[np.ndarray, " q"], root: Float[np.ndarray, "q q"]
+    load: Load | Spectrum, q: Float[np.ndarray, " q"], root: Float[np.ndarray, "q q"]
 ) -> Float[np.ndarray, "q q"]:
     """H⁻¹ by central second differences of F.
 
@@ -223,9 +234,8 @@ def posterior(
     """`Fit.posterior`."""
     if draws < 1:
         raise ValueError(f"draws is {draws}; it must be at least 1, as in 1000")
-    lane, known, cov = given(fit, recording, driver)
-    load, least, own = Minimum.of(lane, known, fit)
-    if load.gains.discrepancy is not None:
+    (load, least, own), known, cov = minimum_of(fit, recording, driver)
+    if isinstance(load, Load) and load.gains.discrepancy is not None:
         raise ValueError(
             "the circuit of this fit leaves more than noise, and ± contain it; the unknown numbers "
             "of what it leaves are too many for draws. Use fit.profile or fit.intervals()"
@@ -254,6 +264,27 @@ def posterior(
     return Posterior(fit.circuit, np.asarray(fit.cov), found, weights[possible])
 
 
+def minimum_of(
+    fit: Fit, recording: Recording | None, driver: Driver | None
+) -> tuple[Minimum, Known, Float[np.ndarray, "element element"]]:
+    """The minimum of a fit, what is known besides, and the covariance of the log elements.
+
+    Raises:
+        ValueError: As in `Fit.posterior`.
+    """
+    require("fit", fit, Fit)
+    measured = fit.measured if recording is None else None
+    if measured is None:
+        lane, known, cov = given(fit, recording, driver)
+        return Minimum.of(lane, known, fit), known, cov
+    of = solved(measured, fit.circuit, chain_of(measured))
+    own = of_circuit(measured.bounds, fit.circuit)
+    cov = of.cov if own else _determined(fit)  # the draws begin with those without bounds
+    feed = GivenDriver.measured(measured.frequency)
+    known = Known(feed, ElementPrior.of(measured.known, fit.circuit), own)
+    return Minimum.of_spectrum(of), known, cov
+
+
 def given(
     fit: Fit, recording: Recording | None, driver: Driver | None
 ) -> tuple[Harmonics, Known, Float[np.ndarray, "element element"]]:
@@ -264,8 +295,6 @@ def given(
     """
     require("fit", fit, Fit)
     recording, driver = fit.source_or_own(recording, driver)
-    if recording is None and fit.measured is not None:
-        raise ValueError("a fit to a measured impedance has no draws and no profiles")
     if recording is None:
         raise ValueError(
             "this fit does not know its recording and its driver; pass both, as in "
@@ -304,6 +333,9 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
     """
     values = np.asarray(fit.circuit.values())
     cov = np.asarray(fit.cov) / np.outer(values, values)
+    for name, _, error in fit.measured.known if fit.measured else ():
+        if error == 0:
+            cov[(place := fit.circuit.names().index(name)), place] = FIXED**2
     if not is_definite(cov):
         raise _undetermined(fit)
     return cov
@@ -342,6 +374,8 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
 
 def _effects(fit: Fit, recording: Recording | None, driver: Driver | None) -> Effects:
     """The effects of errors of the instrument on a fit of a file, from its recording."""
+    if fit.measured is not None:
+        raise ValueError("a fit to a measured impedance has no budget: ± contain its noise alone")
     if fit.method == "joint":
         raise ValueError(
             "this joint fit has no budget: pass instrument=etid.Instrument() to identify_jointly, "

@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import FIXED, require_element
-from etid.identify.posterior import Known, Minimum, costs, given
+from etid.identify.posterior import Known, Minimum, costs, minimum_of
+from etid.identify.spectrum import Spectrum
 from etid.likelihood.linear import LevenbergMarquardt, NormalEquations
 from etid.likelihood.search import Anew
 from etid.precision import array_function, in_float64, one_thread
@@ -38,7 +39,7 @@ class _Inside:
         slope: Slopes of the walls.
     """
 
-    terms: Anew
+    terms: Anew | Spectrum
     free: Bool[np.ndarray, "row q"]
     low: Float[np.ndarray, " q"]
     high: Float[np.ndarray, " q"]
@@ -95,8 +96,10 @@ def _profile(
     free = np.ones(starts.shape, bool)
     free[:-1, number] = False
     rows = load.of(np.zeros(len(starts), int))
+    is_spectrum = isinstance(rows, Spectrum)
+    terms = rows if is_spectrum else Anew(rows, rows.gains.at(rows.knots.index))
     problem = _Inside(
-        Anew(rows, rows.gains.at(rows.knots.index)),
+        terms,
         free,
         q + low * errors,
         q + high * errors,
@@ -114,11 +117,10 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
     """`Fit.profile`."""
     names = fit.circuit.names()
     require_element(name, fit.circuit)
-    lane, known, cov = given(fit, recording, driver)
+    least, known, cov = minimum_of(fit, recording, driver)
     number = names.index(name)
     if known.elements is not None and known.elements.width[number] <= FIXED:
         raise ValueError(f"{name} is fixed, so it has no profile; take another element")
-    least = Minimum.of(lane, known, fit)
     of = known, fit.circuit, number, np.sqrt(np.diagonal(cov))
     logs, deviance = _profile(least, *of)
     ends = {one: (low, high) for one, low, high in known.bounds}

@@ -260,8 +260,9 @@ _OF_SPECTRUM = {
         "part."
     ),
     "insensitive": (
-        "The impedance does not determine a parameter: its standard error exceeds its value. "
-        "Measure at more frequencies, fit a simpler circuit, or hold an element (fixed)."
+        "The impedance does not determine a parameter: its standard error exceeds its value, or it "
+        "could be three times as large. Measure at more frequencies, fit a simpler circuit, or "
+        "hold an element (fixed)."
     ),
 }
 
