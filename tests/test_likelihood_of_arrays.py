@@ -24,8 +24,8 @@ def driver(study):
 def of(driver, *records, first=0, last=None):
     """The likelihood of recordings, as rows if there are several."""
     both = [[getattr(one, name)[first:last] for one in records] for name in ("v_th", "v_out")]
-    both = [np.stack(v) if len(v) > 1 else v[0] for v in both]
-    return etid.Likelihood.of(*both, driver, **RATES)
+    v_th, v_out = (np.stack(v) if len(v) > 1 else v[0] for v in both)
+    return etid.Likelihood.of(v_th, v_out, driver, **RATES)
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -112,6 +112,41 @@ def test_a_measured_current_needs_no_driver(study, driver):
     assert likelihood.names == ("r_s", "r_p", "c_p", "delay")
     fit, other = likelihood.fit(), etid.identify_skin(one.without_v_th())
     np.testing.assert_allclose(fit.circuit.values(), other.circuit.values(), rtol=1e-6)
+
+
+def test_a_current_beside_v_th_is_a_second_output():
+    """Arrays are not aligned by whole samples, and this record needs no alignment."""
+    scene = etid.scenes.paper_dry(snr_db=60.0, current_snr_db=60.0)
+    study = scene.simulate(seed=0)
+    driver, one = etid.identify_driver(study["calibration/98k8"], order=5), study["typical/dry/01"]
+    assert one.current is not None
+    likelihood = etid.Likelihood.of(one.v_th, one.v_out, driver, current=one.current, **RATES)
+    assert likelihood.names[3:5] == ("delay", "current_delay")
+    fit, other = likelihood.fit(), etid.identify_skin(one, driver)
+    assert fit.verdict == other.verdict == "successful"
+    # The current is given without the step of its converter.
+    np.testing.assert_allclose(fit.circuit.values(), other.circuit.values(), rtol=1e-6)
+    np.testing.assert_allclose(fit.cov, other.cov, rtol=1e-3)
+    q = likelihood.start()
+    z = q[5:] - likelihood.load.centre[5:]
+    again = likelihood.q(likelihood.circuit(q), q[3] / 200e3, z, q[4] / 200e3)
+    np.testing.assert_allclose(again, q, rtol=1e-9, atol=1e-12)
+
+    def lost(delay):
+        return -2 * likelihood.log_prob(likelihood.circuit(q), q[3] / 200e3, z, delay)
+
+    # Twice the logarithm is the sum of the squares of the terms, up to a constant.
+    squares = [(likelihood.residual(of) ** 2).sum() for of in (q, q + 0.1 * np.eye(q.size)[4])]
+    moved = lost((q[4] + 0.1) / 200e3) - lost(q[4] / 200e3)
+    np.testing.assert_allclose(moved, np.diff(squares)[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("with_driver", "last"), [(False, None), (True, 3000)])
+def test_a_current_beside_v_th_needs_a_driver_and_periods(study, driver, with_driver, last):
+    both = study[PATHS[0]].v_th[:last], study[PATHS[0]].v_out[:last]
+    of = driver if with_driver else None
+    with pytest.raises(ValueError, match="a driver and two whole pulse periods"):
+        etid.Likelihood.of(*both, of, current=both[0], **RATES)
 
 
 def test_refusals(study):

@@ -350,9 +350,18 @@ class HarmonicsWithCurrent(Harmonics):
         return *of_voltages, selected & usable, rate, turned, variance_i
 
     @classmethod
+    def of_both(cls, voltages: Harmonics, current: Harmonics) -> "HarmonicsWithCurrent":
+        """The lane of bare arrays, from those of `v_th` with `v_out`, and with the current."""
+        *of_voltages, selected, rate, _ = (
+            getattr(voltages, one.name) for one in dataclasses.fields(voltages)
+        )
+        selected = selected & current.selected
+        return cls(*[*of_voltages, selected, rate, current.y, current.variance_y])
+
+    @classmethod
     def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "HarmonicsWithCurrent":
         """Refused: bare arrays have no current."""
-        raise ValueError("arrays have no current; use the method maximum_likelihood")
+        raise ValueError("arrays have no current; use etid.Likelihood with current=")
 
     def realigned(self, late: Lags) -> "HarmonicsWithCurrent":
         """The lane with `v_out` and the current advanced by whole samples, each by its own lag."""

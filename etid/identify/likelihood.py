@@ -3,7 +3,9 @@
 It is the one that `identify_skin` maximises: gains of the load and of Z_th, the unknown unloaded
 voltage profiled out (`etid.likelihood.profile`). Its parameters q are
 
-    ln of each element,   the trigger delay [samples],   z.
+    ln of each element,   the trigger delay [samples],   z,
+
+with a second delay if the current was measured besides.
 
 z is what the calibrations leave open of Z_th, in their standard deviations; a priori it is normal.
 """
@@ -15,7 +17,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several, significant
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
-from etid.estimators.lanes import Harmonics, unstacked
+from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, unstacked
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import calibrated, load_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
@@ -64,6 +66,7 @@ class Likelihood(Overviewed, Module):
         *,
         sample_rate: float,
         pulse_rate: float,
+        current: Float[AnyArray, "*row time"] | None = None,
         resolution: float = 0.0,
     ) -> "Likelihood":
         """The likelihood of bare arrays, whose noise is measured; there is no pre-flight.
@@ -76,10 +79,13 @@ class Likelihood(Overviewed, Module):
             sample_rate: Samples per second [Hz].
             pulse_rate: Pulses per second [Hz]. Several whole periods are harmonics, any other
                 records bins.
+            current: Current [A] through the load, if it was measured besides V_th; for several
+                whole periods.
             resolution: Step of the converter [V] at the terminal; 0 if not known.
 
         Raises:
-            ValueError: The driver or the circuit cannot be used.
+            ValueError: The driver or the circuit cannot be used, or the records with a current hold
+                no two whole periods.
         """
         if driver is None:
             feed = MEASURED_CURRENT
@@ -87,10 +93,18 @@ class Likelihood(Overviewed, Module):
             require("driver", driver, Driver)
             feed = serving(driver, ContinuousDriver, str(MAXIMUM_LIKELIHOOD))
         [structure] = candidates_of(circuit)
-        lane, known = given(
-            v_th, v_out, feed, MAXIMUM_LIKELIHOOD, sample_rate, pulse_rate, resolution
-        )
+        of = feed, MAXIMUM_LIKELIHOOD, sample_rate, pulse_rate
+        lane, known = given(v_th, v_out, *of, resolution)
         assert isinstance(lane, Harmonics)  # as all lanes of maximum likelihood are
+        if current is not None:
+            if driver is None or not lane.periodic:
+                raise ValueError(
+                    "a current beside V_th needs a driver and two whole pulse periods; without a "
+                    "driver, pass the current in place of V_th"
+                )
+            by_current, _ = given(v_th, current, *of, 0.0)
+            assert isinstance(by_current, Harmonics)
+            lane = HarmonicsWithCurrent.of_both(lane, by_current)
         load = load_of(lane, source_of(known), structure, None, calibrated(known))
         return cls(lane, feed, known, load)
 
@@ -99,7 +113,8 @@ class Likelihood(Overviewed, Module):
         """Names of the parameters q."""
         gains = self.load.gains
         count = self.load.centre.shape[-1] - gains.owned
-        return (*gains.circuit.names(), "delay", *(f"z_{i}" for i in range(count)))
+        delays = ("delay", "current_delay")[: gains.outputs.count]
+        return (*gains.circuit.names(), *delays, *(f"z_{i}" for i in range(count)))
 
     def _overview(self) -> Overview:
         lane, kind = self.lane, type(self.load.gains.circuit).__name__
@@ -129,6 +144,7 @@ class Likelihood(Overviewed, Module):
         circuit: AbstractCircuit,
         delay: Float[AnyArray, "*row"] | float = 0.0,
         z: Float[AnyArray, "*row z"] | float = 0.0,
+        current_delay: Float[AnyArray, "*row"] | float = 0.0,
     ) -> Float[AnyArray, "*row q"]:
         """The parameters of a circuit.
 
@@ -136,15 +152,16 @@ class Likelihood(Overviewed, Module):
             circuit: Circuit of the kind of the likelihood.
             delay: Trigger delay of V_out [s].
             z: Deviations of Z_th from what the calibrations say [standard deviations].
+            current_delay: Trigger delay of a current beside V_th [s].
 
         Returns:
             The parameters.
         """
         gains, centre = self.load.gains, self.load.centre
         logs, mean = circuit.log_values(), centre[gains.owned :]
-        xp = namespace(logs, delay, z)
-        late = xp.asarray(delay * gains.sample_rate, float)[..., None]
-        parts = logs, late, mean + xp.asarray(z, float)
+        xp, delays = namespace(logs, delay, z), (delay, current_delay)[: gains.outputs.count]
+        late = [xp.asarray(of * gains.sample_rate, float)[..., None] for of in delays]
+        parts = logs, *late, mean + xp.asarray(z, float)
         rows = np.broadcast_shapes(*(of.shape[:-1] for of in parts))
         return xp.concatenate([xp.broadcast_to(of, (*rows, of.shape[-1])) for of in parts], -1)
 
@@ -180,6 +197,7 @@ class Likelihood(Overviewed, Module):
         circuit: AbstractCircuit,
         delay: Float[AnyArray, "*row"] | float = 0.0,
         z: Float[AnyArray, "*row z"] | float = 0.0,
+        current_delay: Float[AnyArray, "*row"] | float = 0.0,
     ) -> Float[AnyArray, "*row"]:
         """Logarithm of the likelihood and of the priors of delay and z, up to a constant.
 
@@ -189,8 +207,9 @@ class Likelihood(Overviewed, Module):
             circuit: As in `q`.
             delay: As in `q`.
             z: As in `q`.
+            current_delay: As in `q`.
         """
-        return -self.load.objective(self.q(circuit, delay, z))
+        return -self.load.objective(self.q(circuit, delay, z, current_delay))
 
     @in_float64
     @array_function
