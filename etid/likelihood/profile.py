@@ -406,7 +406,12 @@ def _factored(
 def _flat(
     changes: Complex[AnyArray, "*row change output bin"],
 ) -> Float[AnyArray, "*row change part"]:
-    return real_parts(changes.reshape(*changes.shape[:-2], -1))
+    """Real and imaginary parts in any order, for sums of products."""
+    *first, outputs, bins = changes.shape
+    flat = changes.reshape(*first, outputs * bins)
+    if isinstance(flat, np.ndarray):  # those of long records take as long to copy as to multiply
+        return np.ascontiguousarray(flat, complex).view(float)
+    return real_parts(flat)
 
 
 def weighted_sum(
@@ -414,8 +419,11 @@ def weighted_sum(
 ) -> Complex[AnyArray, "*row output bin"]:
     """Σ of changes of the outputs of these sizes, the first of which they are."""
     few, (outputs, bins) = sizes[..., None, : changes.shape[-3]], changes.shape[-2:]
-    flat = changes.reshape(*changes.shape[:-2], outputs * bins)
-    found = few @ flat.real + 1j * (few @ flat.imag)
+    if isinstance(changes, np.ndarray):
+        found = (few @ _flat(changes)).view(complex)
+    else:
+        flat = changes.reshape(*changes.shape[:-2], outputs * bins)
+        found = few @ flat.real + 1j * (few @ flat.imag)
     return found.reshape(*found.shape[:-2], outputs, bins)
 
 

@@ -93,6 +93,11 @@ def disturbances(
     return xp.where(are_seen(first), found / LARGEST, 0.0)
 
 
+@functools.lru_cache(maxsize=4)
+def _kept(bins: int, first: float) -> Complex[np.ndarray, "disturbance bin"]:
+    return disturbances(bins, np.asarray(first))
+
+
 def are_seen(first: Float[AnyArray, ""] | float) -> Bool[AnyArray, ""]:
     """Whether hum and wander are told from decays in records whose first bin is there [Hz]."""
     return namespace(first).asarray(first < MAINS[0] / SHORTEST)
@@ -102,7 +107,8 @@ def disturbed(
     of: Complex[AnyArray, "*row some bin"], first: Float[AnyArray, ""] | float
 ) -> Complex[AnyArray, "*row more bin"]:
     """The states of a record and, after them, those of hum and wander."""
-    xp, added = namespace(of, first), disturbances(of.shape[-1], first)
+    xp, bins = namespace(of, first), of.shape[-1]
+    added = _kept(bins, float(first)) if namespace(first) is np else disturbances(bins, first)
     return xp.concatenate([of, added + xp.zeros((*of.shape[:-2], 1, 1))], -2)
 
 
@@ -289,10 +295,14 @@ def states_of_calibrations(
 ) -> States:
     """The states of calibrations behind one source, each with its own; resistors have none."""
     xp, count, bins = namespace(gains), gains.shape[-2], gains.shape[-1]
-    alone = np.eye(count)[:, None, :, None]
-    rows = gains.shape[:-2]
-    inputs = (-decays[..., None, :, None, :] * alone).reshape(*rows, -1, count, bins)
-    of_ends = (alone * of_ends[:, None, :]).reshape(-1, count, bins) + xp.zeros((*rows, 1, 1, 1))
+    rows, alone = gains.shape[:-2], np.eye(count)[:, None, :, None]
+    if count == 1:  # of a long record, a product with 1 takes as long as all others
+        inputs, of_ends = -decays[..., None, :], of_ends[:, None, :]
+    else:
+        inputs = (-decays[..., None, :, None, :] * alone).reshape(*rows, -1, count, bins)
+        of_ends = (alone * of_ends[:, None, :]).reshape(-1, count, bins)
+    inputs = xp.broadcast_to(inputs, (*rows, *inputs.shape[-3:]))
+    of_ends = xp.broadcast_to(of_ends, (*rows, *of_ends.shape))
     outputs = xp.concatenate([inputs * gains[..., None, :, :], of_ends], -3)
     each = [xp.repeat(width, of) for of in (decays.shape[-2], of_ends.shape[-3] // count)]
     return States(inputs, outputs, xp.concatenate(each) + xp.zeros((*rows, 1)))
