@@ -70,6 +70,7 @@ calls = {
     "etid.identify_impedance([1.0, 2.0], [1.0, 1.0], fixed={'r_s': '5k'})": "fixed['r_s']",
     "etid.identify_skin(rec, d, circuit='R_0-p(R_1,X_1)')": "circuit",
     "etid.identify_skin(rec, d, circuit='SkinCole')": "circuit",
+    "etid.identify_impedances([(v, v)])": "spectra",
     "etid.identify_driver([cal, cal])": "calibrations[1]",
     "etid.identify_amplitudes([of_current, of_current])": "recordings[1]",
     "etid.Tracker.of(None, cal, electrodes=2)": "driver",

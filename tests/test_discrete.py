@@ -136,3 +136,12 @@ def test_refusals_of_arrays():
     with pytest.raises(ValueError, match="at least one"):
         etid.steiglitz_mcbride(x, x, 2, iterations=0)
     assert np.isnan(etid.steiglitz_mcbride(x, x, 2).a).any()  # nothing determines it
+
+
+def test_strings_are_circuits_and_a_filter_looks_at_no_later_sample():
+    named, given = (
+        etid.Filter.bilinear(of, RATE) for of in ("R0-p(R1,C1)", etid.circuit("R0-p(R1,C1)"))
+    )
+    np.testing.assert_array_equal(named.b, given.b)
+    with pytest.raises(ValueError, match=r"a\[0\] is 0"):
+        etid.Filter.of(np.array([1.0, 2.0]), np.array([0.0, 1.0]))

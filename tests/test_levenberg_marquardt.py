@@ -1,6 +1,8 @@
 """The search that all fits share: its minima, its steps, and what must not stop it."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +43,7 @@ def powell(y):
 class Terms:
     """Residuals of rows, each with its own data if there are any."""
 
-    residual: object
+    residual: Callable[..., Any]
     data: np.ndarray | None = None
     in_numpy: bool = True
 

@@ -154,3 +154,20 @@ def test_refusals(study):
     old = etid.identify_driver(study["calibration/98k8"], method="steiglitz_mcbride", throw=False)
     with pytest.raises(ValueError, match="maximum_likelihood"):
         etid.Likelihood.of(one.v_th, one.v_out, old, **RATES)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"circuit": "auto"}, "of one circuit, not of 'auto'"),
+        ({"sample_rate": -1.0}, "sample_rate is -1 Hz"),
+        ({"sample_rate": 60.0, "pulse_rate": 200e3}, "pulses must be slower than samples"),
+        ({"pulse_rate": 0.0}, "pulse_rate 0 Hz"),
+        ({"resolution": -1.0}, "resolution -1 V"),
+    ],
+)
+def test_what_cannot_be_is_refused(study, driver, changed, words):
+    one = study[PATHS[0]]
+    given = {"v_th": one.v_th, "v_out": one.v_out, "driver": driver, **RATES}
+    with pytest.raises(ValueError, match=words):
+        etid.Likelihood.of(**(given | changed))

@@ -167,3 +167,53 @@ def test_wrong_tables_are_refused(arguments, words):
     spectra, *labels = arguments
     with pytest.raises(ValueError, match=words):
         etid.identify_impedances(spectra, labels=labels[0] if labels else None)
+
+
+def test_what_was_told_is_said_and_fixed_elements_are_not_counted():
+    z, sigma = spectrum()
+    free = etid.identify_impedance(F, z, stderr=sigma)
+    held = etid.identify_impedance(F, z, stderr=sigma, fixed={"r_s": float(free.circuit.r_s)})
+    assert "Told before the fit: r_s = " in str(held)
+    assert (held.free, free.free) == (2, 3)
+    # The minimum is the same, to the part of it that ends a search.
+    np.testing.assert_allclose(free.aic - held.aic, 2.0, atol=1e-3)
+    np.testing.assert_allclose(free.bic - held.bic, np.log(2 * F.size), atol=1e-3)
+    bounds = {"r_s": (40e3, None)}
+    wrong = etid.identify_impedance(F, z, stderr=sigma, bounds=bounds, throw=False)
+    assert "r_s above 40 kΩ (bounds)" in str(wrong)
+    assert "Impedance and bounds contradict" in str(wrong)
+    assert str(wrong).count("outside") == 1
+
+
+def test_fits_of_a_table_know_their_impedance_and_those_of_a_file_say_that_they_do_not(tmp_path):
+    spectra = {"a": (F, spectrum()[0]), "bad": (F, F[1:]), "b": (F, *spectrum(seed=1))}
+    fits = etid.identify_impedances(spectra, fixed={"r_s": 33.4e3})
+    alone = etid.identify_impedance(F, spectra["a"][1], fixed={"r_s": 33.4e3})
+    for one in (fits[0], fits["a"], fits.usable()[0], etid.Fits.concatenate([fits, fits])[3]):
+        np.testing.assert_array_equal(one.residual().whitened, alone.residual().whitened)
+    found = fits["b"].profile("r_p"), fits["b"].posterior(draws=100)
+    assert found[0].interval()[0] < fits.circuit.r_p[2] < found[0].interval()[1]
+    assert fits["bad"].measured is None
+    fits.write(tmp_path / "fits.h5")
+    kept = etid.Fits.read(tmp_path / "fits.h5")
+    assert "Told before the fit" in str(kept[0])
+    for call in (kept[0].residual, kept[0].posterior, lambda: kept[0].profile("r_p")):
+        with pytest.raises(ValueError, match="identify the impedance again"):
+            call()
+    with pytest.raises(TypeError, match="identify the impedance again"):
+        kept[0].plot()
+    with pytest.raises(ValueError, match="a report is on recordings"):
+        etid.write_report(tmp_path / "fits.h5", tmp_path / "page.html")
+
+
+def test_each_column_of_a_table_has_one_unit():
+    """It was that of small values, with numbers of another."""
+    large = etid.SkinRC(20.0, 100.0, 20e-6)
+    spectra = {name: (F, spectrum(large, seed)[0]) for seed, name in enumerate("ab")}
+    text = str(etid.identify_impedances(spectra, labels={"a": {"subject": "1"}}))
+    assert "r_s [Ω]" in text
+    assert "c_p [µF]" in text
+    rows = [line.split() for line in text.splitlines()[2:4]]
+    assert [row[0] for row in rows] == ["-", "1"]  # one has no label
+    for row in rows:
+        assert abs(float(row[2]) - 20.0) < 1.0

@@ -12,6 +12,7 @@ from jaxtyping import Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import rounded, significant
 from etid.circuits.impedance import divider
+from etid.circuits.lookup import circuit
 from etid.circuits.overview import Overview, Overviewed
 from etid.precision import Module, array_function, in_float64, is_traced, namespace
 from etid.signals.filtering import StateSpace, companion, simulate
@@ -66,9 +67,14 @@ class Filter(Overviewed, Module):
             b: Numerator, in powers of z⁻¹.
             a: Denominator.
             sample_rate: Samples per second [Hz].
+
+        Raises:
+            ValueError: a₀ is 0.
         """
         xp = namespace(b, a)
         b, a = xp.asarray(b, float), xp.asarray(a, float)
+        if xp is np and a[0] == 0:
+            raise ValueError("a[0] is 0; the output at a sample would need later ones")
         return cls._of(companion(b, a), sample_rate)
 
     @classmethod
@@ -76,7 +82,7 @@ class Filter(Overviewed, Module):
     @array_function
     def bilinear(
         cls,
-        impedance: "AbstractCircuit | _HasStates",
+        impedance: "AbstractCircuit | _HasStates | str",
         sample_rate: float | Float[AnyArray, ""],
         samples: int = 10_000,
     ) -> "Filter":
@@ -86,13 +92,16 @@ class Filter(Overviewed, Module):
         `etid.predict` has no such error.
 
         Args:
-            impedance: A circuit, or the Z_th of a driver by maximum likelihood, `driver.source`.
+            impedance: A circuit or a circuit string, or the Z_th of a driver by maximum likelihood,
+                `driver.source`.
             sample_rate: Samples per second [Hz].
             samples: Length of the records, for ladders that stand for constant phases.
 
         Raises:
             ValueError: The impedance grows without bound, or its response in time is not known.
         """
+        if isinstance(impedance, str):
+            impedance = circuit(impedance)
         if isinstance(impedance, AbstractCircuit):
             of = impedance.impedance().state_space(sample_rate, samples)
         else:

@@ -42,7 +42,7 @@ PREFIXES = {
 def scaled(unit: str, value: float = np.nan, error: float = np.nan) -> tuple[float, str]:
     """Size [SI] and symbol of the unit in which a value is shown, or its error if this is larger.
 
-    It is that of `DISPLAY`, or one with another prefix if the number would be below 0.01 or above
+    It is that of `DISPLAY`, or one with another prefix if the number would be below 0.1 or above
     10 000.
 
     Args:
@@ -52,7 +52,7 @@ def scaled(unit: str, value: float = np.nan, error: float = np.nan) -> tuple[flo
     """
     size = max(abs(value), error) if np.isfinite(error) else abs(value)
     shown = size / DISPLAY[unit][0]
-    usual = not (np.isfinite(shown) and shown > 0) or 0.01 <= shown < 1e4
+    usual = not (np.isfinite(shown) and shown > 0) or 0.0999 <= shown < 1e4
     if usual or unit not in SYMBOLS:
         return DISPLAY[unit]
     power = int(np.clip(3 * np.floor(np.log10(size) / 3), min(PREFIXES), max(PREFIXES)))

@@ -23,7 +23,7 @@ from etid.identify.kramers_kronig import checked_spectrum
 from etid.identify.options import Circuit, Interval, Options, candidates_of
 from etid.identify.planning import Refusal, failed_fit
 from etid.identify.spectrum import chain_of
-from etid.identify.spectrum_fit import METHOD, fit_spectrum
+from etid.identify.spectrum_fit import METHOD, Told, fit_spectrum
 from etid.identify.study import table
 from etid.precision import in_float64, one_thread
 from etid.recordings.errors import RecordingError
@@ -80,7 +80,7 @@ def identify_impedance(
         IdentificationError: The result cannot be used and `throw` is set.
     """
     options = _options(circuit, fixed, prior, bounds)
-    measured = _measured((frequency, impedance, stderr), options)
+    measured = _measured((frequency, impedance, stderr))
     fit = with_data(_choice(measured, options).fit, measured)
     if throw and not fit.usable:
         causes = " ".join([fit.note, *texts(int(fit.remarks))])
@@ -124,6 +124,12 @@ def identify_impedances(
             bound is not of the circuit.
     """
     options, labels = _options(circuit, fixed, prior, bounds), labels or {}
+    if not isinstance(spectra, Mapping):
+        raise RecordingError(
+            f"is {type(spectra).__name__}, must name the impedances",
+            field="spectra",
+            remedy='Pass {"s01/dry": (frequency, impedance)}',
+        )
     if not spectra:
         raise ValueError("there is no impedance to identify")
     unknown = [path for path in labels if path not in spectra]
@@ -133,24 +139,29 @@ def identify_impedances(
             f"labels has {unknown[0]!r}; its keys are paths of impedances, and each has some of "
             f"{', '.join(LABELS)}"
         )
-    found, notes = [], []
+    found, notes, known = [], [], []
     for path, arrays in tqdm(spectra.items(), unit="fit", disable=not progress):
         try:
-            one = _choice(_measured(arrays, options), options)
+            measured = _measured(arrays)
+            one = _choice(measured, options)
             note = one.fit.note
         except (ValueError, TypeError) as error:
-            refusal = Refusal.of(RecordingError(str(error), path=path))
+            refusal, measured = Refusal.of(RecordingError(str(error), path=path)), None
             failed, note = failed_fit(refusal.name, options, METHOD), refusal.note
             one = Selection.of({0: failed}, 0, options.circuits)
         found.append(one)
         notes.append(note)
+        known.append(measured)
     number = common(found, options.circuits)
     for row, one in enumerate(found):
         if number != one.chosen and number in one.fits:
             found[row] = again = Selection.of(one.fits, number, options.circuits)
             notes[row] = " ".join(filter(None, (again.fit.note, deserves(again, number))))
     fits = concatenated([stacked([one.fit]) for one in found])
-    return table([{"path": path, **labels.get(path, {})} for path in spectra], fits, notes)
+    named = [{"path": path, **labels.get(path, {})} for path in spectra]
+    measured = np.empty(len(known), object)
+    measured[:] = known
+    return dataclasses.replace(table(named, fits, notes), measured=measured)
 
 
 def _options(
@@ -169,18 +180,18 @@ def _options(
     return options
 
 
-def _measured(of: Sequence[Any], options: Options) -> MeasuredImpedance:
-    """The impedance from its arrays, with what is known of its elements."""
+def _measured(of: Sequence[Any]) -> MeasuredImpedance:
+    """The impedance from its arrays."""
     if not 2 <= len(of) <= 3:
         raise ValueError(f"has {several(len(of), 'array')}; give frequencies and impedances")
     three: list[Any] = [*of, None][:3]
-    return MeasuredImpedance(*checked_spectrum(*three), options.known, options.bounds)
+    return MeasuredImpedance(*checked_spectrum(*three))
 
 
 def _choice(measured: MeasuredImpedance, options: Options) -> Selection:
     """The fits of all circuits; they take a few hundredths of a second each."""
-    chain = chain_of(measured)
-    fits = {i: fit_spectrum(measured, one, chain) for i, one in enumerate(options.circuits)}
+    of = chain_of(measured), Told(options.known, options.bounds)
+    fits = {i: fit_spectrum(measured, one, *of) for i, one in enumerate(options.circuits)}
     selection = Selection.of(fits, best(fits), options.circuits)
     if selection.fit.usable:
         return selection

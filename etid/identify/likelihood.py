@@ -10,6 +10,8 @@ with a second delay if the current was measured besides.
 z is what the calibrations leave open of Z_th, in their standard deviations; a priori it is normal.
 """
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -41,6 +43,9 @@ class Likelihood(Overviewed, Module):
 
     `Likelihood.of` makes it from arrays. All methods are functions of arrays: JAX can trace,
     differentiate and map them, and with arrays of NumPy nothing is compiled.
+
+    The parameters q are the logarithms of the elements, the trigger delay [samples], and z, what
+    the calibrations leave open of Z_th [standard deviations]; `names` lists them.
 
     Attributes:
         lane: Harmonics of the records, or bins of records of any length, with their noise.
@@ -92,7 +97,20 @@ class Likelihood(Overviewed, Module):
         else:
             require("driver", driver, Driver)
             feed = serving(driver, ContinuousDriver, str(MAXIMUM_LIKELIHOOD))
-        [structure] = candidates_of(circuit)
+        structure, *others = candidates_of(circuit)
+        if others:
+            raise ValueError("a likelihood is of one circuit, not of 'auto'; fit each, and compare")
+        if not (0 < 2 * pulse_rate < sample_rate < math.inf and resolution >= 0):
+            raise ValueError(
+                f"sample_rate is {sample_rate:g} Hz, pulse_rate {pulse_rate:g} Hz, resolution "
+                f"{resolution:g} V; pulses must be slower than samples, and none negative"
+            )
+        shapes = {np.shape(of) for of in (v_th, v_out, v_out if current is None else current)}
+        if len(shapes) > 1:
+            raise ValueError(
+                f"the records have the shapes {', '.join(map(str, sorted(shapes)))}; they must "
+                "have one, (…, time)"
+            )
         of = feed, MAXIMUM_LIKELIHOOD, sample_rate, pulse_rate
         lane, known = given(v_th, v_out, *of, resolution)
         assert isinstance(lane, Harmonics)  # as all lanes of maximum likelihood are
@@ -214,9 +232,10 @@ class Likelihood(Overviewed, Module):
     @in_float64
     @array_function
     def information(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row q q"]:
-        """Fisher information about the parameters, with that of the priors.
+        """Fisher information about the parameters q, with that of the priors.
 
-        Its inverse is the Cramer-Rao bound of their covariance.
+        The elements are in logarithms, so that their errors are relative. Its inverse is the
+        Cramer-Rao bound of the covariance.
         """
         jacobian = Near.of(self.load, self._at_knots, q).jacobian
         told = np.eye(q.shape[-1]) / self.load.width**2

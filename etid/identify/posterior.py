@@ -37,7 +37,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.fitting import fits_of, is_shared, known_of
 from etid.identify.spectrum import Spectrum, chain_of
-from etid.identify.spectrum_fit import Solved, solved
+from etid.identify.spectrum_fit import Solved, Told, solved
 from etid.likelihood.approximate import approximated, departs
 from etid.likelihood.search import ROWS, Load, minimum
 from etid.precision import array_function, in_float64, one_thread
@@ -277,11 +277,11 @@ def minimum_of(
     if measured is None:
         lane, known, cov = given(fit, recording, driver)
         return Minimum.of(lane, known, fit), known, cov
-    of = solved(measured, fit.circuit, chain_of(measured))
-    own = of_circuit(measured.bounds, fit.circuit)
+    told = Told.of(fit.method)
+    of, own = solved(measured, fit.circuit, chain_of(measured), told), told.bounds
     cov = of.cov if own else _determined(fit)  # the draws begin with those without bounds
     feed = GivenDriver.measured(measured.frequency)
-    known = Known(feed, ElementPrior.of(measured.known, fit.circuit), own)
+    known = Known(feed, ElementPrior.of(told.known, fit.circuit), own)
     return Minimum.of_spectrum(of), known, cov
 
 
@@ -296,10 +296,7 @@ def given(
     require("fit", fit, Fit)
     recording, driver = fit.source_or_own(recording, driver)
     if recording is None:
-        raise ValueError(
-            "this fit does not know its recording and its driver; pass both, as in "
-            "fit.posterior(recording, driver)"
-        )
+        raise fit.without_source("fit.posterior")
     recording, feed = fed(recording, driver)
     fit.refuse_batch()
     if fit.method.partition("(")[0] != MAXIMUM_LIKELIHOOD.name:
@@ -333,7 +330,7 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
     """
     values = np.asarray(fit.circuit.values())
     cov = np.asarray(fit.cov) / np.outer(values, values)
-    for name, _, error in fit.measured.known if fit.measured else ():
+    for name, _, error in Told.of(fit.method).known if fit.measured else ():
         if error == 0:
             cov[(place := fit.circuit.names().index(name)), place] = FIXED**2
     if not is_definite(cov):

@@ -43,7 +43,8 @@ def predict(
     """Predict the terminal voltage [V] of a recording, for plots and residuals.
 
     The function fits the state at the start of the record and an offset to `recording.v_out`. JAX
-    can differentiate it by the elements of the circuit, and by the numbers of the driver.
+    can differentiate it by the elements of the circuit, and by the numbers of `driver.source`;
+    `driver.b` and `driver.a` describe the same Z_th and are not used.
 
     Args:
         recording: Unloaded and loaded voltage.

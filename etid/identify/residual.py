@@ -97,10 +97,7 @@ def residual(fit: Fit, recording: Recording | None, driver: Driver | None) -> Re
     if recording is None and fit.measured is not None:
         return _of_impedance(fit, name)
     if recording is None:
-        raise ValueError(
-            "this fit does not know its recording and its driver; pass both, as in "
-            "fit.residual(recording, driver)"
-        )
+        raise fit.without_source("fit.residual")
     own, feed = fed(recording, driver)
     found = whitened(own, feed, fit.circuit, hums=bool(int(fit.remarks) & Remark.mains_hum))
     in_time = np.full(own.v_out.size, np.nan)

@@ -20,7 +20,7 @@ import scipy
 from jaxtyping import Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, impedance_at, with_slopes
-from etid.estimators.element_prior import FIXED, ElementPrior
+from etid.estimators.element_prior import FIXED, ElementPrior, Known
 from etid.identify.kramers_kronig import KramersKronig, kramers_kronig
 from etid.likelihood.linear import NormalEquations
 from etid.results.data import MeasuredImpedance
@@ -92,10 +92,10 @@ class Spectrum:
     noise: float = 1.0
 
     @classmethod
-    def measured(cls, of: MeasuredImpedance, circuit: AbstractCircuit) -> "Spectrum":
+    def measured(cls, of: MeasuredImpedance, circuit: AbstractCircuit, known: Known) -> "Spectrum":
         """The terms of a measured impedance, by rising frequency: neighbours are compared."""
         typical, width = np.asarray(circuit.log_values()), np.full(len(circuit.names()), np.inf)
-        prior = ElementPrior.of(of.known, circuit)
+        prior = ElementPrior.of(known, circuit)
         if prior is not None:
             typical, width = prior.placed(typical), np.asarray(prior.width)
         rising = np.argsort(of.frequency, kind="stable")

@@ -17,6 +17,7 @@ from etid.circuits.branches import in_order
 from etid.circuits.circuit import AbstractCircuit, too_steep
 from etid.circuits.display import several
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
+from etid.estimators.element_prior import Known
 from etid.identify.kramers_kronig import EXACT, FAIL, MISFIT_CHI2, KramersKronig
 from etid.identify.spectrum import ROUNDING, PassiveFit, Spectrum
 from etid.likelihood.linear import LevenbergMarquardt, NormalEquations, taken
@@ -24,10 +25,36 @@ from etid.precision import array_function
 from etid.recordings.remarks import Remark
 from etid.results.data import MeasuredImpedance
 from etid.results.fit import Fit, Support, complex_rrse
+from etid.results.method_options import options_of
 from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.solvers.matrices import inverse
 
 METHOD = "impedance"
+
+
+class Told(NamedTuple):
+    """What is told of elements before a fit; as text it is the method of the fit.
+
+    Attributes:
+        known: Elements that are known.
+        bounds: Elements with bounds.
+    """
+
+    known: Known = ()
+    bounds: Limits = ()
+
+    @classmethod
+    def of(cls, method: str) -> "Told":
+        """What the text of a method says."""
+        options = options_of(method)[1]
+        return cls(options.get("known_elements", ()), options.get("bounds", ()))
+
+    def __str__(self) -> str:
+        of = {"known_elements": self.known, "bounds": self.bounds}
+        options = ", ".join(f"{name}={value!r}" for name, value in of.items() if value)
+        return f"{METHOD}({options})" if options else METHOD
+
+
 # Three steps in a row that reduce the sum of squares by less than this part end a fit, at a
 # distance of less than 1e-4 standard errors from its minimum.
 ENOUGH = 1e-8
@@ -105,14 +132,17 @@ class Solved(NamedTuple):
 
 @array_function
 def solved(
-    measured: MeasuredImpedance, circuit: AbstractCircuit, chain: KramersKronig | None
+    measured: MeasuredImpedance,
+    circuit: AbstractCircuit,
+    chain: KramersKronig | None,
+    told: Told,
 ) -> Solved:
     """The minimum of a measured impedance; without standard errors its `chain` judges it.
 
     Raises:
         ValueError: There are too few impedances for the elements.
     """
-    spectrum = Spectrum.measured(measured, circuit)
+    spectrum = Spectrum.measured(measured, circuit, told.known)
     size, free = measured.z.size, spectrum.free
     if 2 * size <= free.sum():
         given, wanted = several(size, "impedance"), several(int(free.sum()), "element")
@@ -130,17 +160,20 @@ def solved(
         other = Least.of(spectrum, spectrum.scattered())
         least = min(least, other, key=lambda one: float(one.equations.objective[0]))
     cov, misfit, remark = _judged(least, passive)
-    q, cov = _ordered(least.q, cov, spectrum, of_circuit(measured.bounds, circuit))
+    q, cov = _ordered(least.q, cov, spectrum, of_circuit(told.bounds, circuit))
     return Solved(least, q, cov, misfit, remark)
 
 
 @array_function
 def fit_spectrum(
-    measured: MeasuredImpedance, circuit: AbstractCircuit, chain: KramersKronig | None
+    measured: MeasuredImpedance,
+    circuit: AbstractCircuit,
+    chain: KramersKronig | None,
+    told: Told,
 ) -> Fit:
     """The fit of one circuit, with its verdict; arguments and errors as those of `solved`."""
-    least, q, of_logs, misfit, remark = solved(measured, circuit, chain)
-    spectrum, own, limits = least.spectrum, of_circuit(measured.bounds, circuit), None
+    least, q, of_logs, misfit, remark = solved(measured, circuit, chain, told)
+    spectrum, own, limits = least.spectrum, of_circuit(told.bounds, circuit), None
     values = np.exp(q)
     cov = of_logs * np.outer(values, values)
     deviance, contradicted = 2 * spectrum.objective(q[None])[0], False
@@ -149,10 +182,10 @@ def fit_spectrum(
         values = inside.values if np.isfinite(inside.values).all() else values
         cov, limits = inside.cov, limited(circuit, own, inside.outside)
         deviance, contradicted = deviance + inside.deviance, bool(inside.contradicted)
-        remark |= int(Remark.at_bound) if inside.outside.any() else 0
+        remark |= int(Remark.at_bound) if inside.outside.any() and not contradicted else 0
     free = spectrum.free
-    told = {name: value for name, value, _ in measured.known}  # to the last digit
-    values = np.where(free, values, [told.get(name, np.nan) for name in circuit.names()])
+    exact = {name: value for name, value, _ in told.known}  # to the last digit
+    values = np.where(free, values, [exact.get(name, np.nan) for name in circuit.names()])
     cov, fitted = np.where(free[:, None] & free, cov, 0.0), circuit.of_fit(values)
     relative = np.sqrt(np.diagonal(cov)) / values
     support = dataclasses.replace(  # no changes of the circuit are tested
@@ -175,7 +208,7 @@ def fit_spectrum(
             (~(relative < 1).all() | _open(least, q, of_logs), RESULTS.insensitive),
         ),
         steps=np.asarray(least.steps),
-        method=METHOD,
+        method=str(told),
         remarks=np.asarray(remark),
         limits=limits,
         support=support,

@@ -206,8 +206,8 @@ def _draw(
                 return judging.draw_measured(canvas, None, x)
             case Fit(), _, _:
                 raise TypeError(
-                    "this fit does not know its recording: plot(fit, recording, driver). "
-                    'plot({"skin": fit}) draws its impedance alone'
+                    f'{x.without_source("etid.plot")}; plot({{"skin": fit}}) draws its impedance '
+                    "alone"
                 )
             case Selection(), _, _:
                 raise TypeError(

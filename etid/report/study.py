@@ -56,8 +56,8 @@ def write_report(
             display, `E1` to `E98`. Fits of electrodes without a place have no maps.
 
     Raises:
-        ValueError: `fits` is not a file of fits or holds no fit, or `page` would replace a file
-            that is read.
+        ValueError: `fits` is not a file of fits, holds no fit, or fits of measured impedances, or
+            `page` would replace a file that is read.
         RecordingError: `recordings` is not a file of recordings.
     """
     file = None
@@ -70,6 +70,11 @@ def write_report(
         found = StudyFits.read(file, circuit)
     if not len(found.fits):
         raise ValueError(f"{file or 'fits'}: there is no fit to report on")
+    if found.fits.fit.method.partition("(")[0] == "impedance":
+        raise ValueError(
+            f"{file or 'fits'}: a report is on recordings, and these are fits of measured "
+            "impedances; use fit.report() for each, or etid export for a table"
+        )
     for read in (file, None if isinstance(recordings, Study) else recordings):
         if read and all(map(os.path.exists, (read, page))) and os.path.samefile(read, page):
             raise ValueError(f"{page} would replace a file that is read; name another page")

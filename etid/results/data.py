@@ -49,15 +49,11 @@ class MeasuredImpedance(Overviewed):
         frequency: Frequencies [Hz].
         z: Impedance [Ω].
         stderr: Standard errors of the real and of the imaginary part [Ω]; None if not known.
-        known: Elements that were known before its fit: name, value and standard deviation [SI].
-        bounds: Elements with bounds in its fit: name, lower and upper bound [SI].
     """
 
     frequency: Float[np.ndarray, " frequency"]
     z: Complex[np.ndarray, " frequency"]
     stderr: Float[np.ndarray, " frequency"] | None
-    known: tuple[tuple[str, float, float], ...] = ()
-    bounds: tuple[tuple[str, float, float], ...] = ()
 
     def _overview(self) -> Overview:
         errors = [""] * self.z.size
@@ -102,12 +98,27 @@ class HasSource(Generic[Circuit]):
     def measured(self) -> MeasuredImpedance | None:
         """The impedance of `identify_impedance`; None for all other fits."""
         known = getattr(self, "_data", (None, None))[0]
+        if isinstance(known, Mapping):
+            known = known.get("measured")
         return known if isinstance(known, MeasuredImpedance) else None
 
     @property
     def driver(self) -> Driver | None:
         """The driver of the recording; None if there is none, or if it is not known."""
         return getattr(self, "_data", (None, None))[1]
+
+    def without_source(self, call: str) -> ValueError:
+        """The error of a call such as `fit.residual` that needs what the result was made from."""
+        of: Any = self
+        if of.method.partition("(")[0] == "impedance":
+            return ValueError(
+                "this fit is of a file, which holds no impedances; identify the impedance again, "
+                f"and call {call} of that fit"
+            )
+        return ValueError(
+            "this fit does not know its recording and its driver; pass both, as in "
+            f"{call}(recording, driver)"
+        )
 
     def source_or_own(
         self, recording: Recording | None, driver: Driver | None

@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Generic
@@ -12,9 +11,9 @@ import numpy as np
 
 import etid
 from etid.circuits.circuit import AbstractCircuit, Circuit
-from etid.circuits.display import heading, per_cent, several
+from etid.circuits.display import heading, per_cent, plus_minus, scaled, several
 from etid.circuits.lookup import class_path
-from etid.circuits.overview import Overview, Overviewed, element_rows
+from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import install
 from etid.recordings.fields import DESCRIBING, Label, check_names, wanted_labels
 from etid.results.data import with_data
@@ -89,11 +88,13 @@ class Fits(Overviewed, Generic[Circuit]):
             recording, empty where not given, and numbers that describe the recording.
         notes: A sentence for each fit that is not successful, or whose ± contain what its circuit
             leaves; empty for the others.
+        measured: The impedance of each fit of `identify_impedances`; None for others, and in files.
     """
 
     fit: Fit[Circuit]
     labels: Mapping[str, np.ndarray]
     notes: np.ndarray
+    measured: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         nothing = {name: np.full(len(self.notes), "", object) for name in LABELS}
@@ -130,6 +131,8 @@ class Fits(Overviewed, Generic[Circuit]):
         labels = {
             name: np.asarray(self.labels[name])[row] for name in DESCRIBED if name in self.labels
         }
+        if self.measured is not None:
+            labels["measured"] = self.measured[row]
         return with_data(found, labels)
 
     def _row(self, path: str) -> int:
@@ -159,6 +162,7 @@ class Fits(Overviewed, Generic[Circuit]):
             jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.fit),
             {name: column[index] for name, column in self.labels.items()},
             self.notes[index],
+            None if self.measured is None else self.measured[index],
         )
 
     @classmethod
@@ -171,10 +175,12 @@ class Fits(Overviewed, Generic[Circuit]):
         Returns:
             All fits, in this order.
         """
+        measured = [part.measured for part in parts if part.measured is not None]
         return cls(
             concatenated([part.fit for part in parts]),
             {name: np.concatenate([part.labels[name] for part in parts]) for name in DESCRIBED},
             np.concatenate([part.notes for part in parts]),
+            np.concatenate(measured) if len(measured) == len(parts) else None,
         )
 
     def where(self, **labels: Label | None) -> "Fits[Circuit]":
@@ -272,14 +278,20 @@ class Fits(Overviewed, Generic[Circuit]):
             and len(set(zip(groups, self.labels[name].tolist(), strict=True))) > several
         ]
 
+    @np.errstate(over="ignore", invalid="ignore")  # of a damaged file
     def _overview(self) -> Overview:
-        rows, units = [], self.circuit.units()
-        for group in self.summary("subject", "condition"):
-            where = " ".join(filter(None, (group["subject"], group["condition"]))) or "all"
-            values, errors = (
-                np.array([group[name + part] for name in units]) for part in ("", "_stderr")
-            )
-            elements = [text for _, text, _ in element_rows(units, values, errors)]
+        units, groups = self.circuit.units(), self.summary("subject", "condition")
+        rows, usable = [], self.usable().circuit
+        middle = {
+            name: np.median(of) if (of := getattr(usable, name)).size else np.nan for name in units
+        }  # each column has one unit
+        for group in groups:
+            where = " ".join(filter(None, (group["subject"], group["condition"])))
+            elements = []
+            for name, unit in units.items():
+                scale = scaled(unit, middle[name])[0]
+                elements.append(plus_minus(group[name] / scale, group[f"{name}_stderr"] / scale))
+            where = where or ("all" if len(groups) == 1 else "-")
             rows.append((where, f"{group['usable']}/{group['fits']}", *elements))
         title = f"{several(len(self), 'fit')} of {type(self.circuit).__name__}"
         medians = "Median of the usable fits ± median standard error of one fit."
@@ -288,7 +300,7 @@ class Fits(Overviewed, Generic[Circuit]):
         return Overview(
             f"{title}: {counted(self.verdicts)}" if len(self) else title,
             rows,
-            ("", "usable", *itertools.starmap(heading, units.items())),
+            ("", "usable", *(heading(name, of, middle[name]) for name, of in units.items())),
             [medians, *pooled, *self._inexact()] if self.fit.usable.any() else [],
         )
 

@@ -10,6 +10,7 @@ from etid.circuits.display import between, number, several
 from etid.circuits.overview import Overview
 from etid.precision import Module
 from etid.recordings.fields import LABELS
+from etid.results.method_options import without_known
 
 if TYPE_CHECKING:
     from etid.results.fit import Fit
@@ -63,12 +64,12 @@ class Presented(Module):
 
     @property
     def aic(self) -> Any:
-        """−2 log L + 2 p for p elements (Akaike 1974), as `bic`."""
+        """−2 log L + 2 p for p free elements (Akaike 1974), as `bic`."""
         return self._criterion(2.0)
 
     @property
     def bic(self) -> Any:
-        """−2 log L + p ln n for p elements and n real numbers in the data (Schwarz 1978).
+        """−2 log L + p ln n for p free elements and n real numbers in the data (Schwarz 1978).
 
         L has a constant that depends on the data, so that only fits to the same data compare. A
         choice of the circuit divides −2 log L by noise that exceeds its estimate; this number does
@@ -79,8 +80,15 @@ class Presented(Module):
 
     def _criterion(self, of_each: Any) -> Any:
         lost = np.nan if self.support is None else np.asarray(self.support.deviance, float)
-        found = np.zeros(np.shape(self.rrse)) + lost + of_each * len(self.circuit.names())
+        found = np.zeros(np.shape(self.rrse)) + lost + of_each * self.free
         return found if found.ndim else float(found)
+
+    @property
+    def free(self) -> int:
+        """Number of elements that are not fixed."""
+        of: Any = self
+        known = without_known(of.method, self.circuit.units())[1].count("(fixed)")
+        return len(self.circuit.names()) - known
 
 
 def report(fit: "Fit") -> str:
@@ -106,7 +114,7 @@ def _model(fit: "Fit") -> str:
 
 def _data(fit: "Fit") -> str:
     """Numbers of data and parameters, and the criteria."""
-    count = several(len(fit.circuit.names()), "element")
+    count = several(fit.free, "free element" if fit.free < len(fit.circuit.names()) else "element")
     if fit.support is None or np.isnan(fit.support.terms):
         return f"Data: {count}; no likelihood, so no AIC and no BIC"
     data = several(int(fit.support.terms), "real number")

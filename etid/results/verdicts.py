@@ -264,6 +264,11 @@ _OF_SPECTRUM = {
         "could be three times as large. Measure at more frequencies, fit a simpler circuit, or "
         "hold an element (fixed)."
     ),
+    "out_of_bounds": (
+        "Impedance and bounds contradict each other: without its bounds an element lies more than "
+        "three standard errors outside. Correct the bounds, or fit another circuit."
+    ),
+    "unreadable": "These arrays are no impedance; the note says why.",
 }
 
 
