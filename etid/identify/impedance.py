@@ -139,29 +139,29 @@ def identify_impedances(
             f"labels has {unknown[0]!r}; its keys are paths of impedances, and each has some of "
             f"{', '.join(LABELS)}"
         )
-    found, notes, known = [], [], []
-    for path, arrays in tqdm(spectra.items(), unit="fit", disable=not progress):
+    found, measured = {}, np.full(len(spectra), None, object)
+    every = tqdm(spectra.items(), unit="fit", disable=not progress)
+    for row, (path, arrays) in enumerate(every):
         try:
-            measured = _measured(arrays)
-            one = _choice(measured, options)
-            note = one.fit.note
+            measured[row] = one = _measured(arrays)
+            found[row] = _choice(one, options)
         except (ValueError, TypeError) as error:
-            refusal, measured = Refusal.of(RecordingError(str(error), path=path)), None
-            failed, note = failed_fit(refusal.name, options, METHOD), refusal.note
-            one = Selection.of({0: failed}, 0, options.circuits)
-        found.append(one)
-        notes.append(note)
-        known.append(measured)
-    number = common(found, options.circuits)
-    for row, one in enumerate(found):
-        if number != one.chosen and number in one.fits:
-            found[row] = again = Selection.of(one.fits, number, options.circuits)
-            notes[row] = " ".join(filter(None, (again.fit.note, deserves(again, number))))
-    fits = concatenated([stacked([one.fit]) for one in found])
+            found[row] = Refusal.of(RecordingError(str(error), path=path))
+    chosen = [one for one in found.values() if isinstance(one, Selection)]
+    number = common(chosen, options.circuits) if chosen else 0
+    alone = dataclasses.replace(options, circuits=(options.circuits[number],))
+    fits, notes = [], []
+    for one in found.values():
+        if isinstance(one, Refusal):
+            fits.append(failed_fit(one.name, alone, METHOD))
+            notes.append(one.note)
+            continue
+        again = one if one.chosen == number else Selection.of(one.fits, number, options.circuits)
+        fits.append(again.fit)
+        notes.append(" ".join(filter(None, (again.fit.note, deserves(again, number)))))
     named = [{"path": path, **labels.get(path, {})} for path in spectra]
-    measured = np.empty(len(known), object)
-    measured[:] = known
-    return dataclasses.replace(table(named, fits, notes), measured=measured)
+    whole = table(named, concatenated([stacked([one]) for one in fits]), notes)
+    return dataclasses.replace(whole, measured=measured)
 
 
 def _options(

@@ -30,6 +30,14 @@ from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.solvers.matrices import inverse
 
 METHOD = "impedance"
+# Three steps in a row that reduce the sum of squares by less than this part end a fit, at a
+# distance of less than 1e-4 standard errors from its minimum.
+ENOUGH = 1e-8
+FACTOR = np.log(3.0)  # of an element, which must cost
+SURE = 8.0  # of ½ Σ r², four standard errors; or a quarter of what its own standard error says
+ROUGHLY, LEADING = 10, 5  # steps from all starts; one of so many then goes on
+FEW = 3  # elements, the valley of which is straight
+SIMPLE = 5  # elements, up to which the minimum was always found from the ordinary starts
 
 
 class Told(NamedTuple):
@@ -53,16 +61,6 @@ class Told(NamedTuple):
         of = {"known_elements": self.known, "bounds": self.bounds}
         options = ", ".join(f"{name}={value!r}" for name, value in of.items() if value)
         return f"{METHOD}({options})" if options else METHOD
-
-
-# Three steps in a row that reduce the sum of squares by less than this part end a fit, at a
-# distance of less than 1e-4 standard errors from its minimum.
-ENOUGH = 1e-8
-FACTOR = np.log(3.0)  # of an element, which must cost
-SURE = 8.0  # of ½ Σ r², four standard errors; or a quarter of what its own standard error says
-ROUGHLY, LEADING = 10, 5  # steps from all starts; one of so many then goes on
-FEW = 3  # elements, the valley of which is straight
-SIMPLE = 5  # elements, up to which the minimum was always found from the ordinary starts
 
 
 class Least(NamedTuple):
