@@ -205,10 +205,10 @@ def _draw(
             case MeasuredImpedance(), None, None:
                 return judging.draw_measured(canvas, None, x)
             case Fit(), _, _:
-                raise TypeError(
-                    f'{x.without_source("etid.plot")}; plot({{"skin": fit}}) draws its impedance '
-                    "alone"
-                )
+                why = "this fit does not know its recording: plot(fit, recording, driver)."
+                if x.method.partition("(")[0] == "impedance":
+                    why = f"{x.without_source('plot')}."
+                raise TypeError(f'{why} plot({{"skin": fit}}) draws its impedance alone')
             case Selection(), _, _:
                 raise TypeError(
                     "to draw a selection, pass its recording and driver: "

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, NullLocator
+from matplotlib.ticker import FixedLocator, LogFormatterMathtext, NullLocator
 
+from etid.circuits.display import scaled
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
 from etid.plotting.bands import CLEAR, Bands, bands, continuous, used
@@ -32,6 +33,8 @@ from etid.results.data import MeasuredImpedance
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.selection.selection import Candidate, Selection
+
+SLOW = 1.0  # [Hz]; a spectrum that begins below is shown over Hz
 
 
 def draw_impedance(
@@ -75,22 +78,31 @@ def _diagrams(
     nyquist, magnitude, phase = axes = canvas.three((7.5, 4.6))
     label = "measured" if stderr is None else "measured, ± 2 standard errors"
     point: Any = {"ms": 4, "lw": 0.8, "color": BLUE, "label": label}
+    (of_z, ohms), (of_f, hertz) = scaled("ohm", float(np.median(np.abs(z)))), (1e3, "kHz")
+    if frequency.min() < SLOW:
+        of_f, hertz = 1.0, "Hz"
+    smooth = np.geomspace(frequency.min() / 1.3, frequency.max() * 1.3, POINTS)
+    fitted = None if fit is None else np.asarray(fit.circuit.response(smooth)) * (1e3 / of_z)
+    # The panels below show thousandths of what they get.
+    frequency, smooth, z = frequency * (1e3 / of_f), smooth * (1e3 / of_f), z * (1e3 / of_z)
     size = None if stderr is None else 2 * stderr * np.abs(z) / 1e3
-    if fit is not None:
-        smooth = np.geomspace(frequency.min() / 1.3, frequency.max() * 1.3, POINTS)
-        fitted = np.asarray(fit.circuit.response(np.asarray(smooth)))
+    if fit is not None and fitted is not None:
         line: Any = {"color": ORANGE, "lw": 1.3, "label": "fit"}
         nyquist.plot(np.real(fitted) / 1e3, -np.imag(fitted) / 1e3, **line)
         curve(magnitude, phase, smooth, fitted, **line)
         judged(nyquist, path, fit, *listed(fit))
     nyquist.errorbar(np.real(z) / 1e3, -np.imag(z) / 1e3, size, size, fmt="o", **point)
-    nyquist.set(xlabel="Re Z [kΩ]", ylabel="-Im Z [kΩ]")
+    nyquist.set(xlabel=f"Re Z [{ohms}]", ylabel=f"-Im Z [{ohms}]")
     nyquist.set_aspect("equal", adjustable="datalim")
     points(magnitude, phase, frequency, z, stderr, **point)
     frame(magnitude, phase, np.abs(z) / 1e3)
+    magnitude.set(ylabel=f"|Z| [{ohms}]")
     for axis in (magnitude, phase):
-        axis.set(xlabel="frequency [kHz]")
-    magnitude.xaxis.set_major_formatter("{x:g}")
+        axis.set(xlabel=f"frequency [{hertz}]")
+    form: Any = LogFormatterMathtext() if hertz == "Hz" else "{x:g}"
+    magnitude.xaxis.set_major_formatter(form)
+    if hertz == "Hz":
+        phase.xaxis.set_major_formatter(form)
     legend(axes)
     return axes
 
