@@ -89,9 +89,11 @@ class Least(NamedTuple):
         exact = spectrum.z.size * float(np.mean((ROUNDING / size) ** 2))
         first = LevenbergMarquardt(damping=1e-2, steps=ROUGHLY, patience=3, relative=ENOUGH)
         near = first(spectrum, starts, spectrum.equations(starts), exact)
-        leading = np.argsort(near.equations.objective)[: len(starts) // LEADING]
+        # Of starts that have found one minimum the first counts, whatever rounding says.
+        order = np.argsort(np.float32(near.equations.objective), kind="stable")
+        leading = order[: len(starts) // LEADING]
         found = dataclasses.replace(first, steps=500).further(spectrum, taken(near, leading))
-        best = int(np.argmin(found.equations.objective))
+        best = int(np.argmin(np.float32(found.equations.objective)))
         settled = np.isfinite(found.equations.objective[best]) & ~found.moves[best]
         q, steps = found.q[best], int(found.steps[best])
         alone = cls(spectrum, q, spectrum.equations(q[None]), bool(settled), steps, q[None])
