@@ -226,7 +226,8 @@ def test_hazards_of_the_loop_end_with_0_and_faults_of_the_loop_are_counted(monke
     never = with_fault(Stimulator, "_watch", lambda _: None, "silence")
     assert never[3] > 2 * PAUSE * control_loop.PERIOD
     # In half of the runs the skin becomes wet; not each of them gives a pulse then.
-    assert with_fault(etid.Tracker, "start", as_before, "counter from 0", draws=8)[2] > 0
+    # Beside other tests fewer do: none of eight once.
+    assert with_fault(etid.Tracker, "start", as_before, "counter from 0", draws=20)[2] > 0
 
 
 @pytest.mark.slow
