@@ -34,6 +34,7 @@ from etid.estimators.lanes import (
 )
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify import changes
 from etid.identify.second_minimum import ASIDE, likelier
 from etid.likelihood.noise import MISFIT_CHI2
@@ -232,6 +233,29 @@ def _chosen(fits: dict[int, Fit]) -> int:
 
 
 _Several = TypeVar("_Several", CandidateFits, list[Any])
+
+
+def as_fitted(
+    seen: Inspected,
+    kind: type[Harmonics],
+    circuit: AbstractCircuit,
+    feed: AbstractFeed,
+    hums: bool,
+) -> tuple[Harmonics, Any]:
+    """The lane of a recording that `refitted` ends with, and what is known of its driver.
+
+    Args:
+        seen: The recording; the function corrects its lag.
+        kind: Class of the lane.
+        circuit: The fitted load.
+        feed: Its driver, or the measured current.
+        hums: Whether the harmonics of the mains are left out.
+    """
+    seen.realign(*kind.of(seen).late_by(circuit, feed))
+    lane = kind.of(seen)
+    if hums:
+        lane = lane.without_mains() or lane
+    return lane, known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
 
 
 def refitted(

@@ -139,19 +139,19 @@ def identify_impedances(
             f"labels has {unknown[0]!r}; its keys are paths of impedances, and each has some of "
             f"{', '.join(LABELS)}"
         )
-    found, measured = {}, np.full(len(spectra), None, object)
+    found, measured = [], np.full(len(spectra), None, object)
     every = tqdm(spectra.items(), unit="fit", disable=not progress)
     for row, (path, arrays) in enumerate(every):
         try:
             measured[row] = one = _measured(arrays)
-            found[row] = _choice(one, options)
+            found.append(_choice(one, options))
         except (ValueError, TypeError) as error:
-            found[row] = Refusal.of(RecordingError(str(error), path=path))
-    chosen = [one for one in found.values() if isinstance(one, Selection)]
+            found.append(Refusal.of(RecordingError(str(error), path=path)))
+    chosen = [one for one in found if isinstance(one, Selection)]
     number = common(chosen, options.circuits) if chosen else 0
     alone = dataclasses.replace(options, circuits=(options.circuits[number],))
     fits, notes = [], []
-    for one in found.values():
+    for one in found:
         if isinstance(one, Refusal):
             fits.append(failed_fit(one.name, alone, METHOD))
             notes.append(one.note)

@@ -35,7 +35,7 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
-from etid.identify.fitting import fits_of, is_shared, known_of
+from etid.identify.fitting import as_fitted, fits_of
 from etid.identify.spectrum import Spectrum, chain_of
 from etid.identify.spectrum_fit import Solved, Told, solved
 from etid.likelihood.approximate import approximated, departs
@@ -47,6 +47,7 @@ from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
 from etid.results.instrument import BUDGETED, Budget, Effects
+from etid.results.method_options import fixed
 from etid.results.posterior import Posterior
 from etid.solvers.importance_sampling import drawn
 from etid.solvers.matrices import inverse, inverse_root, is_definite
@@ -308,12 +309,8 @@ def given(
     seen = Inspected.of(recording)
     estimator = cast(MaximumLikelihood, named(fit.method))
     kind = cast(type[Harmonics], estimator.lane_of(seen))
-    late = kind.of(seen).late_by(fit.circuit, feed)  # as `etid.identify.fitting.refitted` does it
-    seen.realign(*late)
-    lane = kind.of(seen)
-    if int(fit.remarks) & Remark.mains_hum:
-        lane = lane.without_mains() or lane
-    known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
+    hums = bool(int(fit.remarks) & Remark.mains_hum)
+    lane, known = as_fitted(seen, kind, fit.circuit, feed, hums)
     elements = ElementPrior.of(estimator.known_elements, fit.circuit)
     if estimator.bounds:  # the draws begin with those of the same fit without bounds
         unbounded = dataclasses.replace(estimator, bounds=())
@@ -330,9 +327,8 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
     """
     values = np.asarray(fit.circuit.values())
     cov = np.asarray(fit.cov) / np.outer(values, values)
-    for name, _, error in Told.of(fit.method).known if fit.measured else ():
-        if error == 0:
-            cov[(place := fit.circuit.names().index(name)), place] = FIXED**2
+    for name in fixed(fit.method) if fit.measured else ():
+        cov[(place := fit.circuit.names().index(name)), place] = FIXED**2
     if not is_definite(cov):
         raise _undetermined(fit)
     return cov

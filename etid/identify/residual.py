@@ -12,7 +12,7 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.rows import calibrated, loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import fed, require
-from etid.identify.fitting import is_shared, known_of
+from etid.identify.fitting import as_fitted
 from etid.identify.predict import predict
 from etid.likelihood.search import minimum
 from etid.precision import array_function, in_float64, one_thread
@@ -58,11 +58,7 @@ def whitened(
     seen = Inspected.of(recording)
     kind = MAXIMUM_LIKELIHOOD.lane_of(seen)
     assert issubclass(kind, Harmonics)
-    late = kind.of(seen).late_by(circuit, feed)  # as `etid.identify.fitting.refitted` does it
-    seen.realign(*late)
-    lane = kind.of(seen)
-    lane = (lane.without_mains() if hums else None) or lane
-    known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
+    lane, known = as_fitted(seen, kind, circuit, feed, hums)
     values = np.asarray(circuit.values())
     held = ElementPrior(values, np.full(values.size, FIXED))
     load = loads_of([lane], source_of(known), circuit, held, calibrated(known))

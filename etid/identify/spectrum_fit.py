@@ -96,7 +96,8 @@ class Least(NamedTuple):
         best = int(np.argmin(np.float32(found.equations.objective)))
         settled = np.isfinite(found.equations.objective[best]) & ~found.moves[best]
         q, steps = found.q[best], int(found.steps[best])
-        alone = cls(spectrum, q, spectrum.equations(q[None]), bool(settled), steps, q[None])
+        equations = taken(found.equations, np.array([best]))
+        alone = cls(spectrum, q, equations, bool(settled), steps, q[None])
         above = found.equations.objective - found.equations.objective[best]
         return alone._replace(near=found.q[above < SURE * max(alone.chi2, 1.0)])
 

@@ -206,7 +206,7 @@ def _draw(
                 return judging.draw_measured(canvas, None, x)
             case Fit(), _, _:
                 why = "this fit does not know its recording: plot(fit, recording, driver)."
-                if x.method.partition("(")[0] == "impedance":
+                if x.of_impedance:
                     why = f"{x.without_source('plot')}."
                 raise TypeError(f'{why} plot({{"skin": fit}}) draws its impedance alone')
             case Selection(), _, _:

@@ -70,7 +70,7 @@ def write_report(
         found = StudyFits.read(file, circuit)
     if not len(found.fits):
         raise ValueError(f"{file or 'fits'}: there is no fit to report on")
-    if found.fits.fit.method.partition("(")[0] == "impedance":
+    if found.fits.fit.of_impedance:
         raise ValueError(
             f"{file or 'fits'}: a report is on recordings, and these are fits of measured "
             "impedances; use fit.report() for each, or etid export for a table"

@@ -107,10 +107,15 @@ class HasSource(Generic[Circuit]):
         """The driver of the recording; None if there is none, or if it is not known."""
         return getattr(self, "_data", (None, None))[1]
 
+    @property
+    def of_impedance(self) -> bool:
+        """Whether it is a fit of a measured impedance, known or not."""
+        of: Any = self
+        return of.method.partition("(")[0] == "impedance"
+
     def without_source(self, call: str) -> ValueError:
         """The error of a call such as `fit.residual` that needs what the result was made from."""
-        of: Any = self
-        if of.method.partition("(")[0] == "impedance":
+        if self.of_impedance:
             return ValueError(
                 "this fit is of a file, which holds no impedances; identify the impedance again, "
                 f"and call {call} of that fit"

@@ -440,7 +440,7 @@ class Fit(Judged, Presented, HasSource[Circuit]):
         doubtful = self.verdict in ("misfit", "inconsistent", "max_steps_reached")
         doubt = "Is what was told right, and in SI units?" if doubtful and self._told[1] else ""
         driver = "" if self.driver is None or self.usable else self.driver.why
-        text = message(self.verdict, self.method.partition("(")[0] == "impedance")
+        text = message(self.verdict, self.of_impedance)
         return [*filter(None, (self.other_circuit, text, own, self.leaves, doubt, driver))]
 
     def _rows(self) -> list[tuple[str, str, str]]:

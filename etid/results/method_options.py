@@ -35,6 +35,15 @@ class _Infinite(ast.NodeTransformer):
         return ast.Constant(math.inf) if node.id == "inf" else node
 
 
+def fixed(method: str) -> list[str]:
+    """Names of the elements that a method holds; empty if it is not the text of one method."""
+    try:
+        known = options_of(method)[1].get("known_elements", ())
+    except ValueError:
+        return []
+    return [name for name, _, error in known if error == 0]
+
+
 def without_known(method: str, units: Mapping[str, str]) -> tuple[str, str]:
     """A method without what was told of elements, and a sentence that says it; empty if nothing.
 

@@ -10,7 +10,7 @@ from etid.circuits.display import between, number, several
 from etid.circuits.overview import Overview
 from etid.precision import Module
 from etid.recordings.fields import LABELS
-from etid.results.method_options import without_known
+from etid.results.method_options import fixed
 
 if TYPE_CHECKING:
     from etid.results.fit import Fit
@@ -87,8 +87,7 @@ class Presented(Module):
     def free(self) -> int:
         """Number of elements that are not fixed."""
         of: Any = self
-        known = without_known(of.method, self.circuit.units())[1].count("(fixed)")
-        return len(self.circuit.names()) - known
+        return len(self.circuit.names()) - len(fixed(of.method))
 
 
 def report(fit: "Fit") -> str:
