@@ -18,7 +18,7 @@ from benchmarks import charts, peers
 from benchmarks.machine import median_time, write_csv
 from benchmarks.peers import START, Problem, harmonics, problem, problem_of
 from benchmarks.runner import QUICK, option, show
-from etid.likelihood.search import Near
+from etid.likelihood.load import Near
 
 PINNED = True
 OPTIONS = (QUICK, option("--folder", default=pathlib.Path()))

@@ -24,8 +24,9 @@ from etid.estimators.maximum_likelihood.rows import load_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
 from etid.likelihood.driver import MAX_STEPS
+from etid.likelihood.load import Load
 from etid.likelihood.profile import Profile
-from etid.likelihood.search import Load, minimum
+from etid.likelihood.search import minimum
 from etid.likelihood.source import Source
 from etid.likelihood.starts import starts
 from etid.precision import array_function

@@ -19,7 +19,7 @@ LONG = {
     "correct_driver": "% corrected",
     "design": "found: pulse 688",
     "hierarchy": "r_p of the population: 1.8",
-    "own_prior": "with: ",
+    "own_prior": "with the prior former_study",
     "own_solver": "jaxopt: [3.344",
     "profile": "+1 standard errors: -2 ln L rises by 1.0",
     "pulse": "after 12 pulses: R_s 33",

@@ -12,8 +12,8 @@ from benchmarks.laboratory import SCALE, Record
 from benchmarks.perturbation_list import PERTURBATIONS
 from benchmarks.perturbed_study import nonlinear, undisturbed
 from etid.likelihood.gains import Slopes
+from etid.likelihood.load import Near
 from etid.likelihood.scores import falling
-from etid.likelihood.search import Near
 from etid.recordings.remarks import Remark
 from etid.signals.knots import knots
 

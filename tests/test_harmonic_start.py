@@ -6,8 +6,8 @@ import pytest
 from etid.circuits.circuit import SkinRC
 from etid.likelihood import starts
 from etid.likelihood.gains import Gains
+from etid.likelihood.load import Load
 from etid.likelihood.profile import Records
-from etid.likelihood.search import Load
 from etid.likelihood.source import Source
 from etid.signals.transfer import delayed
 from tests.test_driver import SOURCE

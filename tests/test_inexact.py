@@ -19,9 +19,10 @@ from etid.likelihood.approximate import departs, with_delta
 from etid.likelihood.discrepancy import FUNCTIONS, Discrepancy, kernels, nodes, splines
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import VoltageAndCurrent
+from etid.likelihood.load import Anew, Near
 from etid.likelihood.noise import is_smooth
 from etid.likelihood.restricted import LEVELS, restricted
-from etid.likelihood.search import Anew, Near, minimum
+from etid.likelihood.search import minimum
 from etid.likelihood.starts import starts
 from etid.recordings.preflight import Inspected
 from etid.results.feed import MEASURED_CURRENT
@@ -342,7 +343,7 @@ def test_its_size_is_that_of_the_restricted_likelihood():
         return np.concatenate([of.real, of.imag], -1)
 
     rows, both = np.concatenate([j, y[None]]), np.concatenate([u, 1j * u])
-    of = precision[None], zero, np.array([left]), HARMONICS
+    of = np.diag(precision)[None], zero, np.array([left]), HARMONICS
     found = restricted(paired(rows)[None], paired(both)[None], *of)
 
     def value(covariance):
@@ -382,7 +383,7 @@ def test_a_change_that_is_the_cause_explains_it():
     rows, unit = ((one.real, one.imag) for one in (rows, np.concatenate([unit, 1j * unit])))
     rows, unit = (np.concatenate(one, -1)[None] for one in (rows, unit))
     none = np.zeros((1, 2))
-    found = restricted(rows, unit, none, none, np.array([size]), HARMONICS)
+    found = restricted(rows, unit, none[..., None] * none, none, np.array([size]), HARMONICS)
     assert found.ratio[0, 0] > 12 > found.ratio[0, 1]
     assert found.explained[0, 0] > 0.9 > found.explained[0, 1]
 

@@ -35,7 +35,7 @@ def test_the_covariance_of_the_driver_is_that_of_all_parameters_at_once():
 
     jacobian, ones = np.stack(parts).swapaxes(1, 2), np.ones((3, ROWS))
     by_x = np.stack([of.T @ part for of, part in zip(of_x, parts, strict=True)])
-    none = np.zeros((3, OWN + COMMON))
+    none = np.zeros((3, OWN + COMMON, OWN + COMMON))
     at = AtMinimum(np.ones(3), np.ones(3), jacobian, ones, ones, 0 * ones, none, {}, by_x)
     found = Eliminated.of(at, OWN)
     bread, both = np.linalg.inv(found.rest.sum(0)), unloaded >= 0

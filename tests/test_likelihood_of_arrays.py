@@ -171,3 +171,72 @@ def test_what_cannot_be_is_refused(study, driver, changed, words):
     given = {"v_th": one.v_th, "v_out": one.v_out, "driver": driver, **RATES}
     with pytest.raises(ValueError, match=words):
         etid.Likelihood.of(**(given | changed))
+
+
+MEAN = np.log([6.2e3, 17e3, 0.64e-9])
+COV = np.array([[0.02, 0.01, 0.0], [0.01, 0.03, -0.01], [0.0, -0.01, 0.02]])
+
+
+def correlated(skin):
+    root = np.linalg.inv(np.linalg.cholesky(COV))
+    return root @ (jnp.log(jnp.stack([skin.r_s, skin.r_p, skin.c_p])) - MEAN)
+
+
+def test_own_prior_of_one_element_is_that_of_its_name(study, driver):
+    one = study[PATHS[2]]
+    plain = etid.identify_skin(one, driver)
+    near = float(plain.circuit.r_s + plain.stderr.r_s)
+
+    def known(skin):
+        return (np.log([skin.r_s]) - np.log(near)) / 0.01
+
+    fit = etid.Likelihood.of(one.v_th, one.v_out, driver, **RATES, prior=known).fit()
+    other = etid.identify_skin(one, driver, prior={"r_s": (near, 0.01 * near)})
+    assert fit.verdict == other.verdict
+    assert fit.method == (
+        "maximum_likelihood with the prior test_own_prior_of_one_element_is_that_of_its_name"
+        ".<locals>.known"
+    )
+    # Both searches stop near the minimum: they may differ by a thousandth of a standard error.
+    away = (fit.circuit.values() - other.circuit.values()) / other.stderr.values()
+    np.testing.assert_allclose(away, 0, atol=1e-3)
+    np.testing.assert_allclose(fit.cov, other.cov, rtol=1e-3)
+
+
+def test_own_prior_is_in_terms_logarithm_and_information(study, driver):
+    one = study[PATHS[0]]
+    of = one.v_th, one.v_out, driver
+    plain, told = (etid.Likelihood.of(*of, **RATES, prior=prior) for prior in (None, correlated))
+    with jax.enable_x64(True):
+        q = plain.start()
+        circuit, off = plain.circuit(q), q[:3] - MEAN
+        apart = off @ np.linalg.inv(COV) @ off
+        assert (told.residual(q) ** 2).sum() - (plain.residual(q) ** 2).sum() == pytest.approx(
+            apart, rel=1e-9
+        )
+        difference = plain.log_prob(circuit) - told.log_prob(circuit)
+        assert difference == pytest.approx(apart / 2, rel=1e-6)
+        added = told.information(q) - plain.information(q)
+    expected = np.zeros_like(added)
+    expected[:3, :3] = np.linalg.inv(COV)
+    # Information about R_s is 1e6 times larger than that of the prior, so the last digits are lost.
+    np.testing.assert_allclose(added, expected, atol=1e-3)
+
+
+def test_own_prior_by_numpy_and_jax_and_of_rows(study, driver):
+    records = [study[path] for path in PATHS[:2]]
+    v_th, v_out = (np.stack([getattr(one, of) for one in records]) for of in ("v_th", "v_out"))
+
+    def fit(v_th, v_out):
+        return etid.Likelihood.of(v_th, v_out, driver, **RATES, prior=correlated).fit()
+
+    rows = fit(v_th, v_out)
+    with jax.enable_x64(True):
+        traced = jax.jit(fit)(jnp.asarray(v_th[0]), jnp.asarray(v_out[0]))
+    alone = fit(v_th[0], v_out[0])
+    for other, row in ((rows, 0), (traced, ())):
+        # All end at the same minimum; the search stops a thousandth of a standard error from it.
+        away = (np.asarray(other.circuit.values())[row] - alone.circuit.values()) / np.asarray(
+            alone.stderr.values()
+        )
+        np.testing.assert_allclose(away, 0, atol=1e-3)

@@ -16,8 +16,9 @@ from etid.identify.fitting import known_of
 from etid.likelihood.fit import fit
 from etid.likelihood.gains import Gains
 from etid.likelihood.linear import DIFFERENCE, LevenbergMarquardt, NormalEquations, bend
+from etid.likelihood.load import Near
 from etid.likelihood.profile import Profile, Records
-from etid.likelihood.search import Near, decided, minimum
+from etid.likelihood.search import decided, minimum
 from etid.likelihood.starts import starts
 from etid.precision import array_function
 from etid.recordings.preflight import Inspected

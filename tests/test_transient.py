@@ -15,8 +15,8 @@ from etid.estimators.lanes import Bins
 from etid.estimators.maximum_likelihood.rows import loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.fitting import known_of
+from etid.likelihood.load import Anew, Near
 from etid.likelihood.profile import Profile, Records, States
-from etid.likelihood.search import Anew, Near
 from etid.likelihood.transient import orders, relaxations
 from etid.precision import array_function
 from etid.recordings.preflight import Inspected

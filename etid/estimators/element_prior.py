@@ -6,10 +6,12 @@ of the fit. Standard errors contain it like any measurement. A fixed element has
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.likelihood.own_prior import OwnPrior
 from etid.precision import Module, namespace
 from etid.signals.transfer import AnyArray
 
@@ -25,10 +27,12 @@ class ElementPrior(Module):
     Attributes:
         told: Values of the elements [SI], whose logarithms are the means; 1 without a prior.
         width: Standard deviations of the logarithms; infinite for elements without a prior.
+        own: A function of the circuit, as of `etid.likelihood.own_prior`, besides.
     """
 
     told: Float[AnyArray, " element"]
     width: Float[AnyArray, " element"]
+    own: OwnPrior | None = eqx.field(static=True, default=None)
 
     @classmethod
     def of(cls, known: Known, circuit: AbstractCircuit) -> "ElementPrior | None":
@@ -42,6 +46,12 @@ class ElementPrior(Module):
             row = names.index(name)
             told[row], width[row] = mean, max(deviation / mean, FIXED)
         return cls(told, width)
+
+    @classmethod
+    def by(cls, own: OwnPrior, circuit: AbstractCircuit) -> "ElementPrior":
+        """A prior that is a function of the circuit."""
+        count = len(circuit.names())
+        return cls(np.ones(count), np.full(count, np.inf), own)
 
     @property
     def centre(self) -> Float[AnyArray, " element"]:

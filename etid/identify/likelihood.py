@@ -12,22 +12,33 @@ z is what the calibrations leave open of Z_th, in their standard deviations; a p
 
 import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several, significant
 from etid.circuits.overview import Overview, Overviewed
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
-from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, unstacked
+from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, taken, unstacked
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.rows import calibrated, load_of, source_of
+from etid.estimators.maximum_likelihood.rows import (
+    calibrated,
+    fit_one,
+    fit_rows,
+    load_of,
+    source_of,
+)
+from etid.estimators.maximum_likelihood.verdict import ACCEPT
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import require
 from etid.identify.options import candidates_of
 from etid.identify.samples import given
 from etid.likelihood.gains import Gains
-from etid.likelihood.search import Load, Near
+from etid.likelihood.load import Load, Near
+from etid.likelihood.own_prior import OwnPrior
 from etid.likelihood.starts import starts
 from etid.precision import Module, array_function, in_float64, is_traced, namespace
 from etid.results.driver import ContinuousDriver, Driver
@@ -73,6 +84,7 @@ class Likelihood(Overviewed, Module):
         pulse_rate: float,
         current: Float[AnyArray, "*row time"] | None = None,
         resolution: float = 0.0,
+        prior: OwnPrior | None = None,
     ) -> "Likelihood":
         """The likelihood of bare arrays, whose noise is measured; there is no pre-flight.
 
@@ -87,6 +99,11 @@ class Likelihood(Overviewed, Module):
             current: Current [A] through the load, if it was measured besides V_th; for several
                 whole periods.
             resolution: Step of the converter [V] at the terminal; 0 if not known.
+            prior: What is known of the elements: a function of a circuit, whose elements are
+                numbers, that returns terms r in standard deviations, −ln p = ½ Σ r² + constant.
+                Correlated normals of the logarithms are r = L⁻¹ (ln e − μ) with L Lᵀ their
+                covariance. JAX traces it where it traces the likelihood; in NumPy its slopes are
+                differences.
 
         Raises:
             ValueError: The driver or the circuit cannot be used, or the records with a current hold
@@ -123,7 +140,8 @@ class Likelihood(Overviewed, Module):
             by_current, _ = given(v_th, current, *of, 0.0)
             assert isinstance(by_current, Harmonics)
             lane = HarmonicsWithCurrent.of_both(lane, by_current)
-        load = load_of(lane, source_of(known), structure, None, calibrated(known))
+        told = None if prior is None else ElementPrior.by(prior, structure)
+        load = load_of(lane, source_of(known), structure, told, calibrated(known))
         return cls(lane, feed, known, load)
 
     @property
@@ -193,7 +211,7 @@ class Likelihood(Overviewed, Module):
     @in_float64
     @array_function
     def residual(self, q: Float[AnyArray, "*row q"]) -> Float[AnyArray, "*row term"]:
-        """Terms r in standard deviations, the priors of delay and z among them.
+        """Terms r in standard deviations, the priors of delay, z and elements among them.
 
         −log p = ½ Σ r² + constant. Solvers of least squares minimise it (optimistix, jaxopt).
         """
@@ -217,7 +235,7 @@ class Likelihood(Overviewed, Module):
         z: Float[AnyArray, "*row z"] | float = 0.0,
         current_delay: Float[AnyArray, "*row"] | float = 0.0,
     ) -> Float[AnyArray, "*row"]:
-        """Logarithm of the likelihood and of the priors of delay and z, up to a constant.
+        """Logarithm of the likelihood and of the priors, up to a constant.
 
         Recordings of one driver share z; add the prior of z once then.
 
@@ -238,8 +256,7 @@ class Likelihood(Overviewed, Module):
         Cramer-Rao bound of the covariance.
         """
         jacobian = Near.of(self.load, self._at_knots, q).jacobian
-        told = np.eye(q.shape[-1]) / self.load.width**2
-        return jacobian @ jacobian.swapaxes(-1, -2) + told
+        return jacobian @ jacobian.swapaxes(-1, -2) + self.load.told(q).matrix
 
     @in_float64
     def fit(self) -> Fit:
@@ -247,10 +264,17 @@ class Likelihood(Overviewed, Module):
 
         JAX can trace it, map it over recordings, and differentiate elements and delays.
         """
-        of = self.feed, self.known, self.load.gains.circuit
-        if is_traced(self) or self.lane.x.ndim == 1:
-            return MAXIMUM_LIKELIHOOD.fit_load(self.lane, *of)
-        return concatenated(MAXIMUM_LIKELIHOOD.fit_rows(unstacked(self.lane), *of))
+        own, circuit, method = self.load.own, self.load.gains.circuit, str(MAXIMUM_LIKELIHOOD)
+        prior = None
+        if own is not None:
+            prior = ElementPrior.by(own, circuit)
+            method = f"{method} with the prior {getattr(own, '__qualname__', own)}"
+        of = self.feed, self.known, circuit, method, prior, (), ACCEPT
+        if is_traced(self):
+            return fit_one(jax.tree.map(jnp.asarray, self.lane), *of)
+        if self.lane.x.ndim == 1:
+            return taken(fit_rows([self.lane], *of)[0], 0)
+        return concatenated(fit_rows(unstacked(self.lane), *of))
 
     @property
     def _at_knots(self) -> Gains:

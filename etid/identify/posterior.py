@@ -1,6 +1,6 @@
 """The distribution of the elements of one fit.
 
-It evaluates the likelihood of `etid.likelihood.search.Load` away from its minimum. The standard
+It evaluates the likelihood of `etid.likelihood.load.Load` away from its minimum. The standard
 errors of a fit are those at the minimum. At low signal-to-noise ratios the likelihood is skewed,
 and its intervals are not symmetric.
 
@@ -39,7 +39,8 @@ from etid.identify.fitting import as_fitted, fits_of
 from etid.identify.spectrum import Spectrum, chain_of
 from etid.identify.spectrum_fit import Solved, Told, solved
 from etid.likelihood.approximate import approximated, departs
-from etid.likelihood.search import ROWS, Load, minimum
+from etid.likelihood.load import ROWS, Load
+from etid.likelihood.search import minimum
 from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
@@ -111,7 +112,7 @@ class Minimum(NamedTuple):
             of = approximated(load, found.near, start[None])
             load, found = of.load, of.least
         rows, q = found.near.jacobian[0], found.q[0]
-        root = inverse_root(rows @ rows.T + np.diag(1 / load.width**2))
+        root = inverse_root(rows @ rows.T + load.told(q).matrix)
         return cls(load, q, _inverse_curvature(load, q, root))
 
 

@@ -14,7 +14,7 @@ from etid.estimators.element_prior import FIXED, require_element
 from etid.identify.posterior import Known, Minimum, costs, minimum_of
 from etid.identify.spectrum import Spectrum
 from etid.likelihood.linear import LevenbergMarquardt, NormalEquations
-from etid.likelihood.search import Anew
+from etid.likelihood.load import Anew
 from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver

@@ -17,9 +17,10 @@ from jaxtyping import Bool, Complex, Float
 from etid.likelihood import scores
 from etid.likelihood.discrepancy import POWERS, Discrepancy, kernels, splines
 from etid.likelihood.linear import taken
+from etid.likelihood.load import Load, Near, of_load
 from etid.likelihood.noise import SMOOTH, is_smooth
 from etid.likelihood.restricted import Restricted, restricted, without
-from etid.likelihood.search import Load, Minimum, Near, minimum, of_load, select
+from etid.likelihood.search import Minimum, minimum, select
 
 ORDINARY = 2 * POWERS.size + 1  # number of the kernel to begin with
 ROUGH = 0.05  # part of the squares, which no δ explains; of smooth errors to 3 % it is 1e-3
@@ -156,9 +157,10 @@ def _restricted(
     harmonics = load.records.x.shape[-1]
     of_changes = near.condensed.rows(np.concatenate(list(changes.values()), 1))
     known = np.concatenate([_exact_rows(load, jacobian), terms[:, None], of_changes], 1)
-    precision = without_delta(load, 1 / load.width**2)
-    pull = precision * without_delta(load, near.q - load.centre)
-    precision = np.broadcast_to(precision, pull.shape)
+    told = load.told(near.q)
+    pull = without_delta(load, told.gradient)
+    precision = without_delta(load, without_delta(load, told.matrix).swapaxes(-1, -2))
+    precision = np.broadcast_to(precision, (*pull.shape, pull.shape[-1]))
     of = known, _by_node(load, near), precision, pull, left
     # Numbers of a search that failed are none.
     known, unknown, precision, pull, left = (np.nan_to_num(one) for one in of)

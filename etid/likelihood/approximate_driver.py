@@ -150,4 +150,4 @@ def _restricted(of: Calibrations, near: Near) -> Restricted:
     none = np.zeros((1, len(known) - 1))
     known = np.concatenate([known, priors], 1)
     unit = np.pad(unit, ((0, 0), (0, priors.shape[1])))
-    return restricted(known[None], unit[None], none, none, size, harmonics)
+    return restricted(known[None], unit[None], none[..., None] * none, none, size, harmonics)

@@ -12,10 +12,11 @@ from etid.likelihood import scores
 from etid.likelihood.approximate import approximated, departs, without_delta
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.linear import diagonal, inverse, replaced, taken
+from etid.likelihood.load import Load, Near
 from etid.likelihood.noise import excess, is_smooth, misses, pull_of_ignored, shows_hum
 from etid.likelihood.profile import rrse
 from etid.likelihood.scores import Linear, Scores
-from etid.likelihood.search import Load, Minimum, Near, minimum, select
+from etid.likelihood.search import Minimum, minimum, select
 from etid.likelihood.source import Errors
 from etid.precision import array_function, held, namespace
 from etid.results.fit import Support
@@ -176,14 +177,14 @@ class _Tested(NamedTuple):
         private = noise if load.unloaded is None else noise * records.variance_y / profile.expected
         values = xp.stack([xp.broadcast_to(share[..., None, :], noise.shape), noise, private], -3)
         means = condensed.means([profile], load.knots, values)
-        precision = 1 / load.width**2
+        told = load.told(q)
         linear = Linear.of(
             near.jacobian,
             means[..., :2, :],
             condensed.part,
-            precision * (q - load.centre),
-            _block(precision[: gains.owned], gains.source.cov),
-            precision,
+            told.gradient,
+            _block(told.matrix[..., : gains.owned, : gains.owned], gains.source.cov),
+            told.matrix,
         )
         changes = scores.changes(load, near)
         rows = {name: condensed.rows(of) for name, of in changes.items()}
@@ -201,7 +202,7 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
     near, at = least.near, least.near.q
     records, profile = load.known(at), near.profile
     share, noise, mean_private, linear, changes, each = _Tested.of(load, near)
-    mean_noise, precision = linear.noise, 1 / load.width**2
+    mean_noise = linear.noise
     gain, spreads, layer = (each[name].of_changes(0) for name in ("gain", "spread", "layer"))
     added = scores.falling(near, every)
     each["falling"] = scores.rough(linear, added, near, every, share, noise, e)
@@ -232,7 +233,8 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
     by_term = elements @ linear.jacobian
     own = (by_term * mean_private[..., None, :]) @ by_term.swapaxes(-1, -2)
     of_own = elements[..., :owned]
-    own = own + (of_own * precision[:owned]) @ of_own.swapaxes(-1, -2)
+    told = load.told(at).matrix[..., :owned, :owned]
+    own = own + of_own @ told @ of_own.swapaxes(-1, -2)
     of_driver = elements[..., owned:]
     shared = of_driver @ source.cov @ of_driver.swapaxes(-1, -2)
     if load.unloaded is not None:
@@ -250,7 +252,7 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
     w = at_knots.w(gains.split(at)[2])
     moved = xp.where(records.used[..., 0, every.index], power(w), 0.0).max(-1)
     rest, delta = load.rest(at) ** 2, slice(gains.exact, owned)
-    beside = rest[..., :e].sum(-1) + rest[..., delta].sum(-1)
+    beside = rest[..., :e].sum(-1) + rest[..., delta].sum(-1) + rest[..., at.shape[-1] :].sum(-1)
     if gains.discrepancy is not None:  # −2 ln of the likelihood without its coefficients
         by_delta = linear.jacobian[..., delta, :]
         curved = np.eye(by_delta.shape[-2]) + by_delta @ by_delta.swapaxes(-1, -2)
@@ -317,12 +319,15 @@ def _is_biased(
     return (xp.abs(moved) > BIASED * xp.sqrt(variance)).any(-1)
 
 
-def _block(own: Float[AnyArray, " own"], of_source: Float[AnyArray, "z z"]) -> AnyArray:
+def _block(
+    own: Float[AnyArray, "*row_or_not own own"], of_source: Float[AnyArray, "z z"]
+) -> Float[AnyArray, "*row_or_not q q"]:
     """Block-diagonal matrix of the priors of the own parameters and of the source."""
-    xp, count, z = namespace(of_source), own.shape[0], of_source.shape[0]
-    upper = xp.concatenate([own[:, None] * np.eye(count), xp.zeros((count, z))], 1)
-    lower = xp.concatenate([xp.zeros((z, count)), of_source], 1)
-    return xp.concatenate([upper, lower], 0)
+    xp, rows, count, z = namespace(own), own.shape[:-2], own.shape[-1], of_source.shape[0]
+    upper = xp.concatenate([own, xp.zeros((*rows, count, z))], -1)
+    beside = xp.broadcast_to(of_source, (*rows, z, z))
+    lower = xp.concatenate([xp.zeros((*rows, z, count)), beside], -1)
+    return xp.concatenate([upper, lower], -2)
 
 
 def would_show(layer: Scores, powers: np.ndarray) -> Float[AnyArray, "*row"]:

@@ -57,7 +57,7 @@ class Restricted(NamedTuple):
 def restricted(
     rows: Float[np.ndarray, "row term part"],
     nodes: Float[np.ndarray, "row node part"],
-    precision: Float[np.ndarray, "row q"],
+    precision: Float[np.ndarray, "row q q"],
     pull: Float[np.ndarray, "row q"],
     left: Float[np.ndarray, " row"],
     harmonics: int,
@@ -68,8 +68,8 @@ def restricted(
     Args:
         rows: J, then y, then further changes.
         nodes: U: real parts of δ, output by output, then imaginary parts.
-        precision: Of the prior of each parameter.
-        pull: The same times its distance from the mean of the prior.
+        precision: Of the priors of the parameters.
+        pull: Gradient of the priors.
         left: What the circuit leaves, relative to the signal.
         harmonics: Number of harmonics.
         parts: Number of real and imaginary parts of δ.
@@ -77,10 +77,9 @@ def restricted(
     count, known = precision.shape[-1], rows.shape[1]
     products = np.concatenate([rows, nodes], 1)
     products = products @ products.swapaxes(-1, -2)
-    own = np.arange(count)
-    products[:, own, own] += precision
-    products[:, own, count] += pull
-    products[:, count, own] += pull
+    products[:, :count, :count] += precision
+    products[:, :count, count] += pull
+    products[:, count, :count] += pull
     whole = diagonal(products)[:, None, count + 1 : known]
     products, known = without(products, count), known - count  # the terms and the changes
     eigen, told = _independent(products[:, None, known:], known, harmonics, parts)

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Complex, Float
 
 from etid.circuits.directions import DIRECTIONS, named, scored
 from etid.likelihood.linear import inverse
-from etid.likelihood.search import Load, Near
+from etid.likelihood.load import Load, Near
 from etid.precision import namespace
 from etid.signals.knots import Knots
 from etid.signals.transfer import AnyArray, as_complex, power, reciprocal
@@ -68,14 +68,13 @@ class Linear(NamedTuple):
         means: Float[AnyArray, "*row 2 part"],
         residual: Float[AnyArray, "*row part"],
         pull: Float[AnyArray, "*row q"],
-        spread: Float[AnyArray, "q q"],
-        precision: Float[AnyArray, " q"],
+        spread: Float[AnyArray, "*row_or_not q q"],
+        precision: Float[AnyArray, "*row_or_not q q"],
     ) -> "Linear":
-        """The terms; `means` are W and C, `precision` is what the priors tell of each parameter."""
+        """The terms; `means` are W and C, `precision` is what the priors tell of the parameters."""
         share, noise = means[..., 0, :], means[..., 1, :]
         weighted = jacobian * share[..., None, :]
-        expected = weighted @ jacobian.swapaxes(-1, -2)
-        expected = expected + precision * np.eye(precision.shape[-1])
+        expected = weighted @ jacobian.swapaxes(-1, -2) + precision
         return cls(jacobian, share, noise, residual, pull, spread, inverse(expected))
 
 
@@ -230,7 +229,7 @@ def rough(
     direction = added - profile.driving * knots.between(made)
     total = (xp.conj(direction) * profile.pull).real.sum((-2, -1))
     total = total + (others * linear.pull).sum(-1)
-    of_priors = ((others @ linear.spread) * others).sum(-1)
+    of_priors = ((others[..., None, :] @ linear.spread)[..., 0, :] * others).sum(-1)
     squares = profile.weight * power(profile.whitened(direction))
     variance = (squares * noise).sum((-2, -1)) + of_priors
     curvature = (squares * share[..., None, :]).sum((-2, -1)) + of_priors

@@ -34,7 +34,7 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC, impedance_at
 from etid.likelihood.gains import VoltageAndCurrent
-from etid.likelihood.search import Load
+from etid.likelihood.load import Load
 from etid.precision import array_function, held, in_turn, namespace
 from etid.signals.transfer import AnyArray, as_complex, power
 

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from etid.circuits.circuit import impedance_tree
 from etid.circuits.current_dependent import current_dependent
 from etid.likelihood.linear import inverse
+from etid.likelihood.load import Load
 from etid.likelihood.profile import Records
-from etid.likelihood.search import Load
 from etid.likelihood.starts import starts as linear_starts
 from etid.nonlinear.amplitudes import Amplitudes
 from etid.nonlinear.balance import to_time

@@ -28,7 +28,7 @@ from etid.identify.driver import identify_driver, with_harmonics
 from etid.identify.skins import identify_skin
 from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.linear import diagonal, inverse
-from etid.likelihood.search import Near
+from etid.likelihood.load import Near
 from etid.likelihood.source_prior import delay_std
 from etid.precision import array_function, in_float64, one_thread
 from etid.recordings.hdf5 import read_calibrations

@@ -16,8 +16,8 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.verdict import judged
 from etid.likelihood.fit import Estimate, fit
 from etid.likelihood.gains import Gains, Voltage, VoltageAndCurrent
+from etid.likelihood.load import ROWS, Load
 from etid.likelihood.profile import Records
-from etid.likelihood.search import ROWS, Load
 from etid.likelihood.shared import Calibrated, Unloaded
 from etid.likelihood.source import Errors, Source, Tolerances
 from etid.likelihood.source_prior import DELAY_WIDTH
@@ -127,7 +127,7 @@ def load_with(
     corners = gains.exact - gains.delays.stop  # [their standard deviations]
     centre = xp.concatenate([own[0], np.zeros(delays + corners), source.mean])
     width = xp.concatenate([own[1], *of_delays, np.ones(corners + source.mean.size)])
-    return Load(gains, records, centre, width, unloaded)
+    return Load(gains, records, centre, width, unloaded, own=prior and prior.own)
 
 
 def loads_of(lanes: Sequence[Harmonics], *of: Any) -> Load:

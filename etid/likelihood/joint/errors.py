@@ -21,9 +21,9 @@ from etid.likelihood import scores
 from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.joint.loads import Loads
 from etid.likelihood.linear import inverse
+from etid.likelihood.load import Near
 from etid.likelihood.noise import excess
 from etid.likelihood.profile import rrse
-from etid.likelihood.search import Near
 from etid.precision import array_function
 from etid.signals.harmonics import signal_share
 from etid.signals.transfer import AnyArray, as_complex
@@ -39,7 +39,7 @@ class AtMinimum(NamedTuple):
         share: Share of signal in each term.
         noise: Variance of each term.
         terms: The terms.
-        precision: What the priors tell of each parameter.
+        precision: What the priors tell of the parameters.
         rows: Derivatives of the terms with respect to each change that is tested.
         by_x: Effect on the gradient of unit noise in X, of two numbers for each knot.
     """
@@ -50,7 +50,7 @@ class AtMinimum(NamedTuple):
     share: Float[np.ndarray, "load term"]
     noise: Float[np.ndarray, "load term"]
     terms: Float[np.ndarray, "load term"]
-    precision: Float[np.ndarray, "load parameter"]
+    precision: Float[np.ndarray, "load parameter parameter"]
     rows: Mapping[str, Float[np.ndarray, "load change term"]]
     by_x: Float[np.ndarray, "load x parameter"]
 
@@ -66,8 +66,7 @@ class AtMinimum(NamedTuple):
 
     def _product(self, weight: Float[np.ndarray, "load term"]) -> AnyArray:
         weighted = self.jacobian * weight[:, None, :]
-        of_priors = self.precision[:, :, None] * np.eye(self.precision.shape[1])
-        return weighted @ self.jacobian.swapaxes(1, 2) + of_priors
+        return weighted @ self.jacobian.swapaxes(1, 2) + self.precision
 
 
 class Eliminated(NamedTuple):
@@ -139,7 +138,7 @@ def at_minimum(
             share=means[:, 0],
             noise=means[:, 1],
             terms=condensed.part,
-            precision=np.broadcast_to(1 / load.width**2, q.shape),
+            precision=np.broadcast_to(load.told(q).matrix, (*q.shape, q.shape[-1])),
             rows={name: condensed.rows(change) for name, change in changes.items()},
             by_x=by_noise(jacobian, brought),
         )
@@ -224,7 +223,7 @@ def tested(
     whole[:, :own, :own] = found.bread + mixed @ slope.swapaxes(1, 2)
     whole[:, :own, own:], whole[:, own:, :own] = mixed, mixed.swapaxes(1, 2)
     whole[:, own:, own:] = common.bread
-    spread = at.precision[:, :, None] * np.eye(at.precision.shape[1])
+    spread = at.precision.copy()
     spread[:, own:, own:] += common.score - np.where(used[:, None, None], found.score, 0.0)
     # At the minimum the other terms have the opposite gradient.
     pull = -(at.jacobian @ at.terms[..., None])[..., 0]

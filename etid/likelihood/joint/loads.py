@@ -12,7 +12,7 @@ from jaxtyping import Bool, Complex, Float
 
 from etid.likelihood.calibrations import DENSE, Calibrations
 from etid.likelihood.gains import FAULTS
-from etid.likelihood.search import ROWS, Load
+from etid.likelihood.load import ROWS, Load
 from etid.likelihood.shared import Calibrated, Unloaded
 from etid.likelihood.source import Source
 from etid.precision import namespace

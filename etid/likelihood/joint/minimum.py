@@ -27,7 +27,8 @@ from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.driver import MAX_STEPS, PATIENCE
 from etid.likelihood.joint.loads import Loads, Signals
 from etid.likelihood.linear import DIFFERENCE, LevenbergMarquardt, NormalEquations
-from etid.likelihood.search import BEFORE, POINTS, Load, Near, decided
+from etid.likelihood.load import Load, Near
+from etid.likelihood.search import BEFORE, POINTS, decided
 from etid.precision import array_function
 from etid.signals.transfer import AnyArray, power
 from etid.solvers.matrices import inverse_root
@@ -250,13 +251,13 @@ def _of_few(load: Load, smooth: int, owns: Float[np.ndarray, "load own"]) -> Par
     """The same for a few loads behind a source whose z are the signals, the `smooth` ones first."""
     every, count = load.knots, owns.shape[1]
     q = np.concatenate([owns, np.zeros((len(owns), load.centre.size - count))], 1)
-    near, prior = Near.of(load, load.gains.at(every.index), q), 1 / load.width[:count]
+    near, prior = Near.of(load, load.gains.at(every.index), q), load.told(q)
     jacobian, terms = near.jacobian, near.condensed.part
     by_own = jacobian[:, :count]
-    told = by_own @ by_own.swapaxes(1, 2) + np.diag(prior**2)
+    told = by_own @ by_own.swapaxes(1, 2) + prior.matrix[..., :count, :count]
     roots = np.stack([inverse_root(one) for one in told])
     back = roots.swapaxes(1, 2)
-    gradient = (by_own @ terms[..., None])[..., 0] + prior * load.rest(q)[:, :count]
+    gradient = (by_own @ terms[..., None])[..., 0] + prior.gradient[:, :count]
 
     def apart(values: AnyArray) -> AnyArray:  # an axis of knots of its own
         return values.reshape(*values.shape[:-1], -1, every.index.size)
