@@ -57,8 +57,15 @@ def _checks_first_call(of, *, typechecker):
 
 
 jaxtyping._decorator.jaxtyped = _checks_first_call
-# A module that is checked asks for a decorator: `@jaxtyped(typechecker=…)`.
-jaxtyping.jaxtyped = functools.partial(functools.partial, _checks_first_call)
+
+
+def _jaxtyped(of=None, **checker):
+    """A module that is checked asks for a decorator: `@jaxtyped(typechecker=…)`."""
+    context = of == "context"
+    return _checks_each_call(of) if context else functools.partial(_checks_first_call, **checker)
+
+
+jaxtyping.jaxtyped = _jaxtyped
 
 
 def pytest_runtest_setup():

@@ -12,14 +12,11 @@ import itertools
 import json
 import math
 import os
-import reprlib
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Array
 
 import etid
 from etid.circuits.circuit import AbstractCircuit
@@ -34,13 +31,12 @@ from etid.results.driver import (
     DiscreteDriver,
     Driver,
     OrderEvidence,
-    SourceImpedance,
 )
 from etid.results.fits import SCHEMA, VERSION, Fits
 from etid.results.hdf5_table import REMEDY, Table, opened_table, write_table
-from etid.results.instrument import TOLERANCES, Instrument
+from etid.results.instrument import Instrument
+from etid.results.tree import as_tree, of_tree
 from etid.results.verdicts import verdicts_of
-from etid.signals.departure import Departure
 
 # |Z_th| [Ω] at 1 kHz: from the transformer of a microphone to the transformer of a tube.
 PLAUSIBLE = (300.0, 300e3)
@@ -275,111 +271,42 @@ def _of_line(line: str) -> tuple[tuple[str, ...], Driver | str]:
     return tuple(paths), stored["failure"]
 
 
-def _lists(module: Any, *names: str) -> dict[str, Any]:
-    """Some arrays of a module as nested lists, or all; None for what it does not have."""
-    names = names or tuple(field.name for field in dataclasses.fields(module))
-    values = {name: getattr(module, name) for name in names}
-    return {
-        name: None if value is None else np.asarray(value).tolist()
-        for name, value in values.items()
-    }
-
-
-def _source(source: SourceImpedance) -> dict[str, Any]:
-    """Z_th; without `departure` where a driver has none."""
-    stored = _lists(dataclasses.replace(source, departure=None))
-    del stored["departure"]
-    if source.departure is not None:
-        stored["departure"] = _lists(source.departure)
-    return stored
+# What a file holds of a driver as it is; `_to_json` adds the rest.
+_NUMBERS = "method", "steps", "rrse", "chi2", "b", "a", "sample_rate"
 
 
 def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
-    stored = {
-        "calibrations": paths,
-        "method": driver.method,
-        "verdict": driver.verdict,
-        "remarks": words(int(driver.remarks)),
-        **_lists(driver, "steps", "rrse", "chi2", "b", "a", "sample_rate"),
-    }
+    words_of = {"verdict": driver.verdict, "remarks": words(int(driver.remarks))}
+    stored = {"calibrations": paths, **words_of, **as_tree(driver, *_NUMBERS)}
     if isinstance(driver, ContinuousDriver):
-        stored |= {
-            **_lists(driver, "cov"),
-            **_lists(driver.calibration, "r_load", "delay_samples", "delay_std_samples", "errors"),
-            "instrument": None if driver.instrument is None else driver.instrument.stored(),
-            "source": _source(driver.source),
-            "tried": _lists(driver.tried),
-        }
+        instrument = None if driver.instrument is None else driver.instrument.stored()
+        own = as_tree(driver, "cov", "source", "tried")
+        stored |= own | as_tree(driver.calibration) | {"instrument": instrument}
     return json.dumps(stored)
 
 
 @in_float64
 def _from_json(stored: Mapping[str, Any]) -> Driver:
     """A driver from the result of `_to_json`, which does not hold harmonics of calibrations."""
-    if not all(isinstance(stored[name], str) for name in ("method", "verdict")):
-        raise TypeError("method and verdict must be texts")
-    rate = float(_numbers(stored, "sample_rate"))
-    if not 0 < rate < math.inf:
-        raise ValueError(f"sample_rate is {rate}")
-    kind = DiscreteDriver if "source" not in stored else _continuous(stored)
-    return kind(
-        b=_numbers(stored, "b", None),
-        a=_numbers(stored, "a", None),
-        sample_rate=rate,
-        rrse=_numbers(stored, "rrse"),
-        chi2=_numbers(stored, "chi2"),
-        result=verdicts_of(np.asarray(stored["verdict"])),
-        steps=jax.device_put(np.asarray(_numbers(stored, "steps")).astype(int)),
-        method=stored["method"],
-        remarks=np.asarray(remarks_of(stored["remarks"])),
-    )
-
-
-def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
-    """`ContinuousDriver` with the fields that a discrete driver does not have."""
-    own = stored["source"]
-    pairs = _numbers(own, "log_omega", None).size
-    reals = _numbers(own, "log_omega_real", None).size
-    counts = dict.fromkeys(("log_omega", "log_zeta", "gain", "slope"), pairs)
-    counts |= dict.fromkeys(("log_omega_real", "gain_real"), reals)
-    parts: dict[str, Any] = {name: _numbers(own, name, count) for name, count in counts.items()}
-    source = SourceImpedance(log_resistance=_numbers(own, "log_resistance"), **parts)
-    size = source.modes
-    if "departure" in own:
-        told = own["departure"]
-        ends, functions = _numbers(told, "ends", 2), _numbers(told, "functions", None, None)
-        coefficients = _numbers(told, "coefficients", 2 * functions.shape[1])
-        delta = Departure(ends, functions, coefficients)
-        source, size = dataclasses.replace(source, departure=delta), size + coefficients.size
-    r_load = _numbers(stored, "r_load", None)
-    delays = _numbers(stored, "delay_samples", r_load.size), _numbers(stored, "delay_std_samples")
-    instrument, told = None, stored["instrument"]
-    if told is not None:
-        numbers = {name: float(_numbers(told, name)) for name in TOLERANCES if name in told}
-        instrument = Instrument(**numbers).as_arrays()
-    errors = None
-    if instrument is not None and stored.get("errors") is not None:
-        errors = _numbers(stored, "errors", instrument.deviations(r_load.size).size)
-    of, orders = stored["tried"], OrderEvidence.none().bic.size
-    adequate = np.asarray(of["adequate"])
-    if adequate.dtype.kind != "b" or adequate.shape != (orders,):
-        raise TypeError(f"adequate is {reprlib.repr(of['adequate'])}")
-    bic, missing_pole = (np.asarray(_numbers(of, name, orders)) for name in ("bic", "missing_pole"))
-    return functools.partial(
-        ContinuousDriver,
-        source=source,
-        cov=_numbers(stored, "cov", size, size),
-        calibration=Calibration(r_load, *delays, errors=errors),
-        instrument=instrument,
-        tried=OrderEvidence(bic, missing_pole, adequate),
-    )
-
-
-def _numbers(stored: Mapping[str, Any], name: str, *shape: int | None) -> Array:
-    """A field as an array of numbers of this shape, in which None is any length."""
-    found = np.asarray(stored[name])
-    if found.dtype.kind not in "iuf" or found.ndim != len(shape):
-        raise TypeError(f"{name} is {reprlib.repr(stored[name])}")
-    if any(wanted not in (None, size) for wanted, size in zip(shape, found.shape, strict=True)):
-        raise ValueError(f"{name} has shape {found.shape}, must be {shape}")
-    return jax.device_put(found.astype(float))
+    others: dict[str, Any] = {
+        "result": verdicts_of(np.asarray(stored["verdict"])),
+        "remarks": np.asarray(remarks_of(stored["remarks"])),
+    }
+    if not 0 < stored["sample_rate"] < math.inf:
+        raise ValueError(f"sample_rate is {stored['sample_rate']}")
+    if "source" not in stored:
+        return of_tree(DiscreteDriver, stored, **others)
+    told = stored["instrument"]
+    instrument = None if told is None else of_tree(Instrument, told).as_arrays()
+    calibration = of_tree(Calibration, stored)
+    if instrument is None:
+        calibration = dataclasses.replace(calibration, errors=None)
+    others |= {"instrument": instrument, "calibration": calibration}
+    driver = of_tree(ContinuousDriver, stored, **others)
+    known = calibration.errors, driver.cov, driver.tried.bic
+    count = instrument and instrument.deviations(calibration.r_load.size).size
+    wanted = count, driver.source.vector().size, OrderEvidence.none().bic.size
+    for of, size in zip(known, wanted, strict=True):
+        if of is not None and len(of) != size:
+            raise ValueError(f"{len(of)} numbers stand where {size} are needed")
+    return driver
