@@ -4,6 +4,7 @@ A row is a recording; an axis of length 2 holds `v_th`, or the measured current,
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,6 +14,13 @@ from etid.signals.lags import shifted, whole_lag
 
 SEAM = 3  # samples on each side of the joint between two periods
 BY_CHANCE = 4.0  # [standard deviations] largest difference that noise makes
+
+
+def part(
+    records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int] | np.ndarray
+) -> Float[np.ndarray, "row 2 time"]:
+    """Some rows of records; no copy if these are all."""
+    return records if len(rows) == len(records) else records[np.asarray(rows)]
 
 
 def flat(

@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float, Int
 from etid.recordings import faults
 from etid.recordings.faults import covariance_of
 from etid.recordings.recording import Recording, Samples, quietly
+from etid.recordings.refusals import refused
 from etid.recordings.remarks import Remark
 from etid.signals.averaging import Differing, differing_aliases, exact_spacing, without_aliases
 from etid.signals.bins import are_coherent
 from etid.signals.disturbances import Joint, Shifts, disturbed, kept
 from etid.signals.drift import clocks_apart, largest_drift
-from etid.signals.filtering import TAPS
 from etid.signals.harmonics import (
     ALIASED,
     aliases,
@@ -30,14 +30,11 @@ from etid.signals.lags import lags_of, whole_lag
 from etid.signals.mains import Hum, separated
 from etid.signals.noise import Noise, floor, noise_of
 from etid.signals.periods import Periods
-from etid.signals.pulse_train import PulseTrain, pulse_trains, rise_time
+from etid.signals.pulse_train import PulseTrain, pulse_trains
 from etid.signals.quick_looks import humming, shows_few, uneven
 from etid.signals.rounding import VISIBLE, is_coarse, step_of
 
 _Key = TypeVar("_Key", bound=Hashable)
-_Rows = Int[np.ndarray, " row"]
-_Holds = Bool[np.ndarray, " row"]
-SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 
 
 class Inspection:
@@ -243,7 +240,7 @@ class Inspection:
             return found
         periods = self.periods[0]
         for spacing, rows in _alike(self.spacing.tolist()).items():
-            of = _part(self.quiet, rows), self.sigma[rows], self.coarse[rows]
+            of = faults.part(self.quiet, rows), self.sigma[rows], self.coarse[rows]
             for row in np.flatnonzero(uneven(*of, spacing, periods)):
                 records, sigma, step = (part[[row]] for part in of)
                 (bad,) = disturbed(records, sigma, step, spacing, periods)
@@ -321,15 +318,7 @@ class Inspection:
 
         Properties of a recording with one fault may have no meaning, and are not asked for.
         """
-        names: list[str | None] = [None] * len(self.recordings)
-        left = np.arange(len(names))
-        for name, applies in _VERDICTS.items():
-            if left.size:
-                found = applies(self, left)
-                for row in left[found]:
-                    names[row] = name
-                left = left[~found]
-        return names
+        return refused(self)
 
     @functools.cached_property
     @quietly()
@@ -459,64 +448,6 @@ def together(recordings: Sequence[Recording]) -> list[tuple[Inspection, list[int
     return [(every if len(alike) == 1 else every.part(rows), rows) for rows in alike]
 
 
-def _too_short(seen: Inspection, rows: _Rows) -> _Holds:
-    shortest = max(SHORTEST, rise_time(seen.sample_rate) + 1)
-    return np.full(rows.size, seen.recorded.shape[2] < shortest)
-
-
-def _saturated(seen: Inspection, rows: _Rows) -> _Holds:
-    nothing = math.nan, math.nan
-    ranges = [seen.recordings[row].adc_range or nothing for row in rows]
-    adc_range = np.repeat(np.array(ranges)[:, None], 2, axis=1)
-    if seen.has_current:
-        adc_range[:, 0] = nothing  # it is one of volts
-    records, limits = _part(seen.recorded, rows), seen.recorded_limits[rows]
-    sigma, step = seen.sigma[rows], seen.step[rows]
-    found = faults.saturated(records, limits, step, adc_range)
-    found[:, 0] &= ~seen.held[rows]  # a command may rest at its limits
-    if seen.has_current:
-        found[:, 0] &= ~faults.held(sigma[:, 0], step[:, 0], seen.spans[rows, 0])
-        return np.asarray(found.any(1))  # a stimulator that holds its voltage is no fault
-    unit = np.maximum(np.maximum(sigma, step), seen.coarse[rows])[:, 1]
-    of = limits[:, 1], unit, seen.correlated[rows], seen.sample_rate
-    return found.any(1) | faults.limited(records, *of)
-
-
-def _implausible(seen: Inspection, rows: _Rows) -> _Holds:
-    found = [seen.has_current and not faults.is_plausible(*seen.spans[row, ::-1]) for row in rows]
-    return np.array(found, bool)
-
-
-def _unconnected(seen: Inspection, rows: _Rows) -> _Holds:
-    if seen.has_current:
-        return np.zeros(rows.size, bool)
-    of = seen.covariance[rows], seen.sigma[rows], seen.correlated[rows]
-    return faults.unconnected(_part(seen.quiet, rows), *of)
-
-
-def _misaligned(seen: Inspection, rows: _Rows) -> _Holds:
-    hopeless = [kept is None and found is not None for kept, found in seen._periods]
-    of_th, of_both, of_out = (seen.covariance[rows, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    wrong = np.array(hopeless, bool)[rows]
-    if seen.has_current:
-        return np.asarray(wrong | (of_both <= 0))  # a passive load takes power
-    return np.asarray(wrong | (of_out > 1.01 * of_th) | np.isnan(seen.correlated[rows]))
-
-
-_VERDICTS = {
-    "too_short": _too_short,
-    "nonfinite_samples": lambda seen, rows: (
-        ~(np.isfinite(seen.limits[rows]).all((1, 2)) & np.isfinite(seen.spans[rows]).all(1))
-    ),
-    "flat": lambda seen, rows: seen.is_flat[rows].any(1),
-    "saturated": _saturated,
-    "wrong_unit": _implausible,
-    "unconnected": _unconnected,
-    "rate_mismatch": lambda seen, rows: seen.mismatch | seen.clocks_differ[rows],
-    "misaligned": _misaligned,
-}
-
-
 def _records(recording: Recording) -> tuple[Samples, Samples]:
     """The cause of `v_out`, and `v_out`."""
     return recording.samples[recording.cause], recording.samples["v_out"]
@@ -528,13 +459,6 @@ def _alike(keys: Sequence[_Key]) -> dict[_Key, list[int]]:
     for row, key in enumerate(keys):
         rows.setdefault(key, []).append(row)
     return rows
-
-
-def _part(
-    records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int] | _Rows
-) -> Float[np.ndarray, "row 2 time"]:
-    """The rows of `records`; no copy if these are all."""
-    return records if len(rows) == len(records) else records[np.asarray(rows)]
 
 
 def _limits(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*record limit"]:
