@@ -42,7 +42,7 @@ outputs: .venv/tools
 test-portable: .venv/tools
 	XLA_FLAGS=--xla_cpu_max_isa=SSE4_2 OPENBLAS_CORETYPE=Nehalem $(BIN)/python -m pytest \
 		--numprocesses auto --dist loadfile -m "stored and not slow" \
-		$$(grep -lE "kept_numbers|import printed|, printed" tests/test_*.py)
+		$$(grep -rlE "kept_numbers|import printed|, printed" tests --include "test_*.py")
 
 slow: .venv/tools
 	$(BIN)/python -m pytest -m slow --numprocesses auto --dist loadfile

@@ -17,7 +17,8 @@ import numpy as np
 import scipy.signal
 
 import etid
-from benchmarks import online, peers
+from benchmarks import peers
+from benchmarks.display import online
 from benchmarks.machine import import_time, interpreter, median_time
 from benchmarks.peers import LOAD, SAMPLES, A, B, Problem, harmonics, problem
 from benchmarks.runner import QUICK, Target, report

@@ -52,8 +52,6 @@ from .identify.skins import identify_skins as identify_skins
 from .identify.skins import select_circuit as select_circuit
 from .identify.study import identify_study as identify_study
 from .nonlinear.identify import identify_amplitudes as identify_amplitudes
-from .online.controller import Controller as Controller
-from .online.tracker import Tracker as Tracker
 from .plotting import plot as plot
 from .plotting.layout import Layout as Layout
 from .plotting.layout import read_layout as read_layout

@@ -112,7 +112,7 @@ for day in ("d1", "d2"):
 print(drivers["d2"])
 
 # %% [markdown]
-# While a display runs, `etid live driver_d1.h5 --socket localhost:5555` shows these maps in the
+# While a display runs, `etid-live driver_d1.h5 --socket localhost:5555` shows these maps in the
 # browser, and a button stops it.
 #
 # ## From the folder to one file

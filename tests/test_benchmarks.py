@@ -11,17 +11,13 @@ import numpy as np
 import pytest
 
 import etid
+import etid.display
 from benchmarks import __main__ as entry
 from benchmarks import (
     amplitude_errors,
     amplitudes,
-    control_loop,
     curves,
     excitations,
-    online,
-    online_alarms,
-    online_faults,
-    online_instruments,
     peers,
     scale,
     selection,
@@ -30,13 +26,18 @@ from benchmarks import (
     which,
 )  # fmt: skip
 from benchmarks.__main__ import NAMES, asked
-from benchmarks.control_hazards import Hazards
+from benchmarks.display import (
+    control_loop,
+    online,
+    online_alarms,
+    online_faults,
+    online_instruments,
+)
+from benchmarks.display.control_hazards import Hazards
 from benchmarks.failure_draws import Effort
 from benchmarks.peers import START, ByNumPy, problem
 from benchmarks.rivals import RivalError
-from etid.live.output import Output
-from etid.live.stimulator import Stimulator
-from etid.online.stream import PAUSE
+from etid.display.stimulator import PAUSE, Output, Stimulator
 
 # What is run of each benchmark, what it writes into the folder {}, and what its output must say.
 # So few draws scatter too much for most targets.
@@ -197,7 +198,7 @@ def only_at_rest(stimulator, output, usual=Stimulator._give_zero):
         usual(stimulator, output)
 
 
-def as_before(tracker, *, at_rest=False, after=None, usual=etid.Tracker.start):
+def as_before(tracker, *, at_rest=False, after=None, usual=etid.display.Tracker.start):
     return usual(tracker, at_rest=at_rest) if after is None else after
 
 
@@ -227,7 +228,7 @@ def test_hazards_of_the_loop_end_with_0_and_faults_of_the_loop_are_counted(monke
     assert never[3] > 2 * PAUSE * control_loop.PERIOD
     # In half of the runs the skin becomes wet; not each of them gives a pulse then.
     # Beside other tests fewer do: none of eight once.
-    assert with_fault(etid.Tracker, "start", as_before, "counter from 0", draws=20)[2] > 0
+    assert with_fault(etid.display.Tracker, "start", as_before, "counter from 0", draws=20)[2] > 0
 
 
 @pytest.mark.slow

@@ -310,8 +310,6 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
     assert rows.keys() == cli.COMMANDS.keys()
     table = tmp_path / "t.csv"
     np.savetxt(table, np.ones((500, 2)), delimiter=",", header="open,skin", comments="")
-    with h5py.File(tmp_path / "p.h5", "w") as pulses:
-        pulses["v_out"] = np.zeros((1, 5000))
     names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
     rates = ("--sample-rate", 2e5, "--pulse-rate", 60)
     calls = {
@@ -323,7 +321,6 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
         "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
         "report": (tmp_path / "f.h5",),
         "export": (tmp_path / "f.h5", "-o", tmp_path / "f.csv"),
-        "live": (study_file, "--file", tmp_path / "p.h5", "--electrodes", 1, "--port", 0),
     }
     assert calls.keys() == cli.COMMANDS.keys()
     for command, arguments in calls.items():
@@ -333,7 +330,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
         assert set(found) - {"command", "status"} <= told, command
         if command == "fit":
             assert (found["method"], found["drivers"][0]["order"]) == ("equation_error", 3)
-        written = {"check": "file", "report": "page", "live": "source"}.get(command, "target")
+        written = {"check": "file", "report": "page"}.get(command, "target")
         assert set(found) >= {"command", "status", written}
         inner = [item for value in found.values() if isinstance(value, list) for item in value]
         groups = [item for item in inner if isinstance(item, dict) and "subject" not in item]

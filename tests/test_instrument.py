@@ -13,15 +13,16 @@ import pytest
 import scipy.stats
 
 import etid
+import etid.display
 from etid import cli
 from etid.circuits.circuit import AbstractCircuit, Farad, Ohm, parameter
 from etid.circuits.elements import capacitor, resistor
 from etid.circuits.impedance import parallel, series
+from etid.display.current import CurrentModel
 from etid.estimators.maximum_likelihood.given_driver import given
 from etid.estimators.maximum_likelihood.rows import source_of
 from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.gains import Gains
-from etid.online.current import CurrentModel
 from etid.precision import array_function
 from etid.recordings.remarks import Remark
 from etid.results.driver import ContinuousDriver, HarmonicDriver
@@ -380,7 +381,7 @@ def tracked(calibration, skin, instrument):
     Ten electrodes, as in other tests: the program for them is compiled.
     """
     driver = etid.identify_driver(calibration, instrument=instrument)
-    tracker = etid.Tracker.of(driver, calibration, electrodes=10)
+    tracker = etid.display.Tracker.of(driver, calibration, electrodes=10)
     state = tracker.start()
     for v_out in tracker.pulses(np.tile(skin.v_out, (10, 1))):
         state = tracker.update(state, v_out)
@@ -412,7 +413,7 @@ def test_a_stated_delay_is_no_help_to_a_tracker_whose_windows_begin_between_two_
     found = []
     for instrument in (None, etid.Instrument(delay=5e-9)):
         driver = etid.identify_driver(calibration, instrument=instrument)
-        tracker = etid.Tracker.of(driver, calibration, electrodes=10)
+        tracker = etid.display.Tracker.of(driver, calibration, electrodes=10)
         state = tracker.start()
         for v_out in tracker.pulses(np.tile(skin.v_out, (10, 1))):
             state = tracker.update(state, v_out)

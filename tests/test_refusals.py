@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import etid
+import etid.display
 from etid.circuits.impedance import realise
 from etid.identify.options import Options
 from etid.plotting import figure_of
@@ -111,8 +112,8 @@ of.tracker.update(of.state, np.zeros((2, 3334))) -> shape \(2, 3334\).* \(2, 333
 of.tracker.update(of.state, of.window, -1.0) -> finite and not negative
 of.tracker.update(of.state, of.window, np.nan) -> finite and not negative
 of.tracker.update(of.state, of.window, np.ones(3)) -> shape \(3,\)
-etid.Tracker.of(of.driver, of.calibration, electrodes=0) -> electrodes is 0
-etid.Tracker.of(of.driver, of.calibration, electrodes=1, change=-1.0) -> change is -1
+etid.display.Tracker.of(of.driver, of.calibration, electrodes=0) -> electrodes is 0
+etid.display.Tracker.of(of.driver, of.calibration, electrodes=1, change=-1.0) -> change is -1
 tracker(of, driver=pictures.as_kind(of.driver, ContinuousDriver)) -> harmonics
 of.tracker.update(of_others(of), of.window) -> 1 electrode of 3 elements, the tracker 2 of 3
 of.tracker.read(of_others(of)) -> 1 electrode of 3 elements, the tracker 2 of 3
@@ -127,7 +128,7 @@ limited(of, current_cap=5.0) -> ampere
 limited(of, current_cap=np.inf) -> ampere
 limited(of, charge_cap=200.0) -> never act
 limited(of, fallback=np.inf) -> infinite
-etid.Controller.of(dataclasses.replace(of.tracker, driver_result=verdict('misfit')))
+etid.display.Controller.of(dataclasses.replace(of.tracker, driver_result=verdict('misfit')))
     -> driver of the tracker cannot be used
 of.controller.command(of.state) -> either charge or current
 of.controller.command(of.state, charge=-1e-09) -> finite and not negative
@@ -163,7 +164,7 @@ etid.identify_driver(of.calibration.replace(v_th=np.zeros(10_000))) -> flat
 etid.identify_driver(of.calibration.replace(v_out=of.calibration.v_th)) -> unconnected
 etid.identify_skin(of.both.replace(current=1000.0 * of.both.current), of.driver)
     -> current .* A, .* ohm
-etid.Tracker.of(of.driver, cut(of.calibration, 1500), electrodes=1) -> not_periodic
+etid.display.Tracker.of(of.driver, cut(of.calibration, 1500), electrodes=1) -> not_periodic
 [Exception]
 etid.identify_driver(of.calibration, method=GUESS) -> guess
 etid.identify_skin(of.skin, of.driver, method=GUESS) -> guess
@@ -199,7 +200,7 @@ def of():
     study = Scene(trials, known, current_snr_db=40.0).simulate(seed=2)
     both, calibration = study["loaded/0"], study["calibration/0"]
     driver = etid.identify_driver(calibration, order=5)
-    tracker = etid.Tracker.of(driver, calibration, electrodes=2)
+    tracker = etid.display.Tracker.of(driver, calibration, electrodes=2)
     made = jax.tree.map(np.asarray, pictures.fit())
     alone, frequency = both.without_v_th(), np.geomspace(60.0, 1e5, 20)
     z = np.asarray(pictures.SKIN.response(jnp.asarray(frequency)))
@@ -217,7 +218,7 @@ def of():
         fit=etid.identify_skin(both.replace(current=None), driver),
         tracker=tracker,
         state=tracker.start(),
-        controller=etid.Controller.of(tracker),
+        controller=etid.display.Controller.of(tracker),
         window=np.zeros((2, tracker.model.bands.samples)),
         batch=jax.tree.map(lambda *leaves: np.stack(leaves), made, made),
     )
@@ -252,7 +253,7 @@ def samples(of, **options):
 
 
 def tracker(of, driver):
-    return etid.Tracker.of(driver, of.calibration, electrodes=1)
+    return etid.display.Tracker.of(driver, of.calibration, electrodes=1)
 
 
 def of_others(of):
@@ -262,7 +263,7 @@ def of_others(of):
 
 
 def limited(of, **limits):
-    return etid.Controller.of(of.tracker, **limits)
+    return etid.display.Controller.of(of.tracker, **limits)
 
 
 USED = cut, faster, skin, samples, tracker, of_others, limited, Twice

@@ -14,7 +14,6 @@ import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from chromium import chromium
 
 import etid
 from etid import cli
@@ -31,6 +30,7 @@ from etid.selection.driver_order import TriedOrder, evidence
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 from tests import pictures
+from tests.chromium import chromium
 
 EXAMPLE = pathlib.Path(__file__).parents[1] / "data_schema" / "example.h5"
 EVIL = r"<script>document.title='$\broken{$'</script>"

@@ -139,7 +139,7 @@ def test_a_test_produces_every_verdict_of_etid():
     """Expected of a real fit: what is only given to a result made by hand does not count."""
     own = set(vars(RESULTS)["_name_to_item"]) - set(vars(optx.RESULTS)["_name_to_item"])
     expected = set()
-    for path in pathlib.Path(__file__).parent.glob("test_*.py"):
+    for path in pathlib.Path(__file__).parent.rglob("test_*.py"):
         text = path.read_text("utf-8")
         if re.search(r"identify_|preflight\(|Tracker|fit_file\(", text):
             expected |= _texts(ast.parse(text))
