@@ -14,7 +14,7 @@ from etid.identify import arguments
 # The tests' own type checker would come first; a process of its own has none.
 CALLS = """
 import jax; jax.config.update("jax_enable_x64", True)
-import numpy as np, etid
+import numpy as np, etid.display
 from benchmarks.specimens import study_fits
 v = np.ones(1000)
 rec = etid.Recording(v, v, sample_rate=2e5, pulse_rate=60.0)

@@ -5,6 +5,7 @@ a change, a fit of the pulse alone where it is new or suspected, and the state a
 """
 
 import dataclasses
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -30,9 +31,9 @@ from etid.display.pulse_fit import (
 )
 from etid.display.state import DRIFT, JUMP, NONE, OPEN, REPEATED, ElectrodeState
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
-from etid.estimators.starts import circuit_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.likelihood.noise import misses
+from etid.likelihood.starts import LEVELS
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, power
@@ -188,7 +189,8 @@ def updated(
     )
     suspected = suspect(before, found, information)
     wanted = suspected.again & (measured.bad == SUCCESSFUL)
-    starts = circuit_starts(model.circuit, None)
+    typical = model.circuit.log_values()
+    starts = jnp.stack([typical + math.log(factor) * powers for factor in LEVELS])
     fresh = jax.lax.cond(
         wanted.any(),
         jax.vmap(lambda of, want, logs: anew(model, of, starts, want, logs)),
