@@ -26,7 +26,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo test test-portable outputs slow ranking notebooks docs wheel-test lint types clean
 
 demo: .venv/package
-	$(BIN)/python -m etid.paper.demo demo/
+	$(BIN)/python -m benchmarks.paper.demo demo/
 
 test: .venv/tools
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile

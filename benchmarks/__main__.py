@@ -19,7 +19,7 @@ NAMES = (
     *("referee", "fuzz", "mutation", "live", "instruments", "directions", "inexact", "real"),
     *("excitations", "spectrum_peers"),
 )
-PLACES = {"rivals": "rivals.table"}  # modules of other names
+PLACES = {"paper": "paper.causes", "rivals": "rivals.table"}  # modules of other names
 
 
 def asked(argv: Sequence[str] | None = None) -> argparse.Namespace:

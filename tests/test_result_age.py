@@ -17,7 +17,7 @@ MADE_BY = {  # tables whose names are not those of their benchmarks
 }
 # No number of a benchmark depends on them.
 SHOWN = (
-    *("cli.py", "commands", "files", "garbage.py", "live", "paper", "plotting", "report"),
+    *("cli.py", "commands", "files", "garbage.py", "live", "plotting", "report"),
     *("results/variation.py", "simulation/calibration.py"),
 )
 # Tables whose numbers depend on them; those of no other do.

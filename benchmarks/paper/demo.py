@@ -1,13 +1,14 @@
 """The paper's experiments: simulated, identified by two methods, and compared with the paper.
 
-    python -m etid.paper.demo FOLDER
+    python -m benchmarks.paper.demo FOLDER
 
 Three laboratories make the same 149 recordings. `quiet` has a signal-to-noise ratio (SNR) of 60 dB
 and no trigger delay. `noisy` has white noise with an SNR of 40 dB and a trigger delay of 200 ns
 (rms). With these values the paper's method has errors of the published size on the built circuit.
-In `rough` the driver is no filter and fingertips are other circuits, too (`etid.paper.rough`). The
-paper does not describe its noise. Its RRSE of 4 to 13 % would correspond to white noise with an
-SNR of 30 dB, but this noise alone gives Steiglitz-McBride an error of 90 % in R_s.
+In `rough` the driver is no filter and fingertips are other circuits, too
+(`benchmarks.paper.rough`). The paper does not describe its noise. Its RRSE of 4 to 13 % would
+correspond to white noise with an SNR of 30 dB, but this noise alone gives Steiglitz-McBride an
+error of 90 % in R_s.
 """
 
 import argparse
@@ -22,18 +23,19 @@ import jax
 import numpy as np
 
 import etid
-from etid.circuits.display import DISPLAY, as_symbol, several, significant
-from etid.paper.rough import rough
-from etid.paper.tables import (
+from benchmarks.paper.rough import rough
+from benchmarks.paper.tables import (
     CALIBRATION,
     LABORATORIES,
     METHODS,
     ORDER,
     Outcome,
+    built_circuit,
     errors,
     identify,
     resistor_errors,
 )
+from etid.circuits.display import DISPLAY, as_symbol, several, significant
 from etid.plotting import figure_of
 from etid.plotting.style import save
 from etid.recordings.replacing import replace_text
@@ -121,14 +123,10 @@ def table_4(outcomes: Sequence[Outcome]) -> Table:
     paper = (f"{error:g} / {scatter:g}" for error, scatter in (TABLE_4[name] for name in ORDER))
     rows = [("paper", "", *paper, "{} to {}".format(*RRSE), "")]
     for outcome in outcomes:
-        built = outcome.skins.where(condition="built")
-        found = errors(built, outcome.truth)
-        cells = [
-            f"{_number(np.mean(found[name]))} / {_number(np.std(found[name], ddof=1))}"
-            for name in ORDER
-        ]
-        quality = _number(100 * float(np.median(built.rrse)))
-        rows.append((*outcome.names, *cells, quality, _successes(built)))
+        found = built_circuit({outcome.names: [outcome]})
+        cells = [f"{_number(row['error'])} / {_number(row['scatter'])}" for row in found]
+        usable = "{successful}/{fits}".format_map(found[0])
+        rows.append((*outcome.names, *cells, _number(found[0]["rrse"]), usable))
     heads = tuple(f"{as_symbol(name)} [%]" for name in ORDER)
     return Table(("records", "method", *heads, "RRSE [%]", "usable"), tuple(rows))
 
@@ -230,7 +228,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         argv: Arguments; default: the arguments of the process.
     """
     parser = argparse.ArgumentParser(
-        prog="python -m etid.paper.demo",
+        prog="python -m benchmarks.paper.demo",
         description="Simulate and identify the paper's experiments.",
     )
     parser.add_argument("folder", type=pathlib.Path, help="folder for all files")
@@ -239,10 +237,12 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     outcomes: list[Outcome] = []
     drawn: tuple[Picture, ...] = ()
+    quiet, noisy = LABORATORIES["quiet"], LABORATORIES["noisy"]
     scenes: dict[str, Scene] = {
-        name: etid.scenes.paper(**settings) for name, settings in LABORATORIES.items()
+        "quiet": etid.scenes.paper(**quiet),
+        "noisy": etid.scenes.paper(**noisy),
+        "rough": rough(**noisy),
     }
-    scenes["rough"] = rough(**LABORATORIES["noisy"])
     for laboratory, scene in scenes.items():
         place = folder if laboratory == "quiet" else folder / laboratory
         place.mkdir(parents=True, exist_ok=True)
