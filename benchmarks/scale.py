@@ -45,7 +45,7 @@ WORKERS = (1, 2)  # 1 is the process itself
 WARM = 8  # recordings that make every process compile
 PATIENCE = 0.002  # [s] between two looks at a run that is to be killed
 
-METHODS = (None, "equation_error")  # None is the default one
+METHODS = (None, "steiglitz_mcbride(iterations=1)")  # None is the default one
 OPTIONS = (
     QUICK,
     option("--recordings", default=100_000),

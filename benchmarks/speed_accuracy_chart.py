@@ -18,7 +18,6 @@ LETTERS = {
     "maximum_likelihood": "max. likelihood",
     "output_error": "output error",
     "steiglitz_mcbride": "Steiglitz-McBride",
-    "equation_error": "equation error",
     "SciPy least_squares, harmonics": "SciPy",
     "SciPy least_squares, lfilter": "lfilter",
     "lmfit leastsq": "lmfit",

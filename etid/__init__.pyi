@@ -26,7 +26,6 @@ from .estimators.maximum_likelihood.estimator import MaximumLikelihood as Maximu
 from .estimators.output_error import OutputError as OutputError
 from .estimators.registry import register as register
 from .estimators.steiglitz_mcbride.arrays import steiglitz_mcbride as steiglitz_mcbride
-from .estimators.steiglitz_mcbride.estimator import EquationError as EquationError
 from .estimators.steiglitz_mcbride.estimator import SteiglitzMcBride as SteiglitzMcBride
 from .files.exporting import export_circuit as export_circuit
 from .files.exporting import export_fits as export_fits

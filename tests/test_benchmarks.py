@@ -243,7 +243,7 @@ def test_scale_measures_everything_and_a_killed_run_loses_nothing(tmp_path, monk
     """One layout and one kill: `test_benchmark_counts` reads the others, `test_streaming` kills."""
     monkeypatch.setattr(scale, "LAYOUTS", ("contiguous",))
     monkeypatch.setattr(scale, "KILLS", 1)
-    plan = scale.Plan(tmp_path, 60, 6, ("equation_error",))
+    plan = scale.Plan(tmp_path, 60, 6, scale.METHODS[1:])
     rows = list(scale.rows(plan))
     assert len(rows) == 3 + 2  # three ways to read, fitted by 1 and 2 processes
     assert all(row["seconds"] > 0 and row["memory_mb"] > 0 for row in rows)

@@ -300,7 +300,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
     run, study_file, tmp_path, monkeypatch
 ):
     def calibrated(records, order, former):
-        driver = etid.identify_driver(records, method="equation_error", throw=False)
+        driver = etid.identify_driver(records, method="steiglitz_mcbride", throw=False)
         return CheckedCalibration(driver, [1e-3], {})
 
     monkeypatch.setattr(calibrate, "calibrate", calibrated)
@@ -320,7 +320,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
         "check": (study_file,),
         "calibrate": (study_file, "-o", tmp_path / "driver.h5"),
         "import": (table, "-o", tmp_path / "i.h5", *names, *rates),
-        "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
+        "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "steiglitz_mcbride", "--order", 3),
         "report": (tmp_path / "f.h5",),
         "export": (tmp_path / "f.h5", "-o", tmp_path / "f.csv"),
         "live": (study_file, "--file", tmp_path / "p.h5", "--electrodes", 1, "--port", 0),
@@ -332,7 +332,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
         found = as_json(printed)
         assert set(found) - {"command", "status"} <= told, command
         if command == "fit":
-            assert (found["method"], found["drivers"][0]["order"]) == ("equation_error", 3)
+            assert (found["method"], found["drivers"][0]["order"]) == ("steiglitz_mcbride", 3)
         written = {"check": "file", "report": "page", "live": "source"}.get(command, "target")
         assert set(found) >= {"command", "status", written}
         inner = [item for value in found.values() if isinstance(value, list) for item in value]

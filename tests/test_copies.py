@@ -115,7 +115,6 @@ CIRCUITS = [
 ESTIMATORS = [
     etid.MaximumLikelihood,
     etid.OutputError,
-    etid.EquationError,
     etid.SteiglitzMcBride,
 ]
 

@@ -122,7 +122,6 @@ OUTPUTS = {
         "etid.OutputError()",
         "etid.SteiglitzMcBride()",
         "etid.SteiglitzMcBride(iterations=3)",
-        "etid.EquationError()",
     ]),
     "errors": (False, [
         "etid.read('absent.h5')",

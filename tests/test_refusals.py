@@ -40,7 +40,7 @@ etid.identify_skins([], of.driver) -> no recording
 etid.identify_study(etid.Study.from_recordings([of.calibration])) -> no loaded recording
 etid.identify_skin(of.skin, of.discrete) -> no continuous source
 etid.identify_skin(faster(of.skin), of.driver, method='steiglitz_mcbride') -> the same sample rate
-etid.identify_skin(of.skin, of.driver, circuit=etid.Resistor(), method='equation_error')
+etid.identify_skin(of.skin, of.driver, circuit=etid.Resistor(), method='steiglitz_mcbride')
     -> identifies SkinRC only
 etid.predict(of.skin, of.driver) -> give the circuit
 skin(of, method='steiglitz_mcbride') -> steiglitz_mcbride.*from a measured current
@@ -70,7 +70,7 @@ etid.Instrument(gain=-1e-3) -> gain
 etid.Instrument(capacitance=5.0) -> \[F\]
 etid.Instrument(r_load=5.0) -> relative
 etid.Instrument(c_load=5.0) -> \[F\]
-etid.identify_driver(of.calibration, instrument=GAIN, method='equation_error') -> equation_error
+etid.identify_driver(of.calibration, instrument=GAIN, method='steiglitz_mcbride') -> gives none
 etid.identify_driver(of.calibration, method='steiglitz_mcbride(steps=3)') -> has no such options
 etid.identify_driver(of.calibration, method='steiglitz_mcbride(iterations=0)')
     -> has no such options
@@ -138,7 +138,7 @@ of.controller.command(of.state, current=np.array([0.0001, 0.006])) -> is wanted;
 etid.identify_study(of.study, order=1) -> order: is 1, must be
 etid.identify_jointly(of.study, order=21) -> order: is 21, must be
 etid.fit_file('absent.h5', 'fits.h5', order=1) -> order: is 1, must be
-etid.identify_study(of.study, order='auto', method='equation_error')
+etid.identify_study(of.study, order='auto', method='steiglitz_mcbride')
     -> needs maximum likelihood
 etid.identify_driver(of.calibration, plausible=(3e5, 3e2)) -> plausible: is \(300000\.0, 300\.0\),
 etid.identify_study(of.study, plausible=(-1.0, 3e2)) -> plausible: is \(\-1\.0, 300\.0\), must be
@@ -147,10 +147,10 @@ etid.fit_file('absent.h5', 'fits.h5', plausible=(1.0, 1.0)) -> plausible: is \(1
 etid.Instrument(drift=1.0) -> drift .* is 1\.0; it is a standard deviation \[relative\], at least
 etid.Instrument(delay=1.0) -> delay .* is 1\.0; it is a standard deviation \[s\], above 0
 etid.Instrument(delay=0.0) -> delay .* is 0\.0; it is a standard deviation \[s\], above 0
-etid.identify_study(of.study, method='equation_error', instrument=GAIN) -> gives none
+etid.identify_study(of.study, method='steiglitz_mcbride', instrument=GAIN) -> gives none
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=-0.1)) -> r_load .* is \-0\.1; it
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=np.nan)) -> r_load .* is nan; it
-etid.identify_study(of.study, method='equation_error', fixed={'r_s': 1.0}) -> no known elements
+etid.identify_study(of.study, method='steiglitz_mcbride', fixed={'r_s': 1.0}) -> no known elements
 etid.identify_study(of.study, circuit='R0-p(R1') -> 'R0\-p\(R1' is no circuit: it ends too early
 etid.identify_skin(of.skin, circuit='R0-R0') -> has R0 twice
 etid.identify_skins([of.skin], circuit='SkinRC')
@@ -213,7 +213,7 @@ def of():
         impedance=etid.identify_impedance(frequency, z),
         driver=driver,
         tolerant=etid.identify_driver(calibration, instrument=GAIN),
-        discrete=etid.identify_driver(calibration, method="equation_error", throw=False),
+        discrete=etid.identify_driver(calibration, method="steiglitz_mcbride", throw=False),
         fit=etid.identify_skin(both.replace(current=None), driver),
         tracker=tracker,
         state=tracker.start(),
