@@ -65,7 +65,6 @@ skin(of, bounds={'r_s': (1.0, 1000.0)}, fixed={'r_s': 5.0}) -> r_s is fixed and 
 skin(of, bounds={'r_s': (1.0, 1000.0)}, method='steiglitz_mcbride')
     -> 'steiglitz_mcbride' takes no known elements and no bounds
 of.impedance.budget() -> a measured impedance has no budget
-of.impedance.plot(show='residual') -> no residual in time
 etid.Instrument(gain=-1e-3) -> gain
 etid.Instrument(capacitance=5.0) -> \[F\]
 etid.Instrument(r_load=5.0) -> relative

@@ -1,4 +1,4 @@
-"""Pictures that judge fits: impedances beside the measured one, residuals, rival circuits."""
+"""Pictures that judge fits: impedances beside the measured one, and rival circuits."""
 
 from typing import Any
 
@@ -8,8 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, LogFormatterMathtext, NullLocator
 
 from etid.circuits.display import scaled
-from etid.identify.arguments import fed
-from etid.identify.predict import predict
 from etid.plotting.bands import CLEAR, Bands, bands, continuous, used
 from etid.plotting.impedances import POINTS, curve, frame, points
 from etid.plotting.style import (
@@ -24,7 +22,6 @@ from etid.plotting.style import (
     legend,
     listed,
     nth,
-    typeset,
     without_elements,
 )
 from etid.recordings.preflight import Inspected
@@ -42,22 +39,17 @@ def draw_impedance(
 ) -> np.ndarray:
     """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
     if not listed(fit):
-        return _empty(canvas, fit, recording.path)
+        axes = canvas.three((7.5, 4.6))
+        for axis in axes:
+            without_elements(axis)
+        judged(axes[0], recording.path, fit)
+        return axes
     recording, known = continuous(recording, driver)
     lane = used(Inspected.of(recording), known, fit.circuit, fit.remarks)
     measured = bands(lane, known, fit.circuit)
     clear = measured.stderr <= CLEAR
     points = measured.frequency[clear], measured.z[clear], measured.stderr[clear]
     return _diagrams(canvas, fit, recording.path, *points)
-
-
-def _empty(canvas: Canvas, fit: Fit, path: str) -> np.ndarray:
-    """Three panels of a fit without elements."""
-    axes = canvas.three((7.5, 4.6))
-    for axis in axes:
-        without_elements(axis)
-    judged(axes[0], path, fit)
-    return axes
 
 
 def draw_measured(canvas: Canvas, fit: Fit | None, measured: MeasuredImpedance) -> np.ndarray:
@@ -105,52 +97,6 @@ def _diagrams(
         phase.xaxis.set_major_formatter(form)
     legend(axes)
     return axes
-
-
-def draw_residual(
-    canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None
-) -> np.ndarray:
-    """The residual, its autocorrelation, and its cross-correlation with V_th or the current.
-
-    A residual of white noise has correlations within the band at 99 % of the lags.
-    """
-    if not listed(fit):
-        return _empty(canvas, fit, recording.path)
-    whole, own, with_input = axes = canvas.three((7.5, 4.6), wide=True)
-    residual = predict(recording, driver, fit.circuit) - recording.v_out
-    known = np.isfinite(residual)
-    whole.plot(1e3 * recording.time, 1e3 * residual, color=BLUE, lw=0.5)
-    whole.set(xlabel="time [ms]", ylabel="residual [mV]")
-    cause = fed(recording, driver)[0].cause
-    clean, cause_known = residual[known], recording.samples[cause].values[known]
-    _correlation(own, clean, clean, "autocorrelation\nof the residual")
-    name = typeset("V_th") if cause == "v_th" else "current"
-    _correlation(with_input, clean, cause_known, f"correlation\nwith earlier {name}")
-    judged(whole, recording.path, fit)
-    legend(axes, own.get_legend_handles_labels()[0])
-    return axes
-
-
-def _correlation(
-    axis: Axes, one: Float[np.ndarray, " time"], other: Float[np.ndarray, " time"], label: str
-) -> None:
-    """Correlation coefficients of `one` with `other` at earlier times, over the lag.
-
-    99 % of white noise does not exceed 2.58 standard deviations.
-    """
-    one, other = one - one.mean(), other - other.mean()
-    lags = np.arange(-60, 61)
-    norm = np.sqrt(np.sum(one**2) * np.sum(other**2))
-    size = one.size
-    products = [
-        np.dot(one[max(lag, 0) : size + min(lag, 0)], other[max(-lag, 0) : size - max(lag, 0)])
-        for lag in lags
-    ]
-    band = 2.58 / np.sqrt(size)
-    band_label = "99 % of white noise (aliases of the edges exceed it)"
-    axis.axhspan(-band, band, color="0.85", lw=0, label=band_label)
-    axis.vlines(lags, 0.0, np.array(products) / norm, color=INK, lw=0.9)
-    axis.set(xlabel="lag [samples]", ylabel=label)
 
 
 def draw_selection(
