@@ -164,6 +164,8 @@ def test_refusals(study):
         ({"sample_rate": 60.0, "pulse_rate": 200e3}, "pulses must be slower than samples"),
         ({"pulse_rate": 0.0}, "pulse_rate 0 Hz"),
         ({"resolution": -1.0}, "resolution -1 V"),
+        ({"v_th": np.append(np.zeros(9_998), [np.nan, np.inf])}, "v_th has 2 values that are not"),
+        ({"v_out": np.append(np.zeros(9_999), np.nan)}, "v_out has 1 value that is not finite"),
     ],
 )
 def test_what_cannot_be_is_refused(study, driver, changed, words):

@@ -52,6 +52,8 @@ samples(of, method=WITH_CURRENT) -> arrays have no current
 skin(of, fixed={'r_x': 1.0}) -> 'r_x' is no element of SkinRC; its elements are r_s, r_p, c_p
 skin(of, fixed={'r_s': -1.0}) -> must be positive
 skin(of, prior={'r_s': (500.0, 50.0)}, fixed={'r_s': 500.0}) -> r_s is fixed and has a prior
+skin(of, circuit='R0-p(R1,CPE1)', fixed={'alpha_1': 2.0}) -> alpha_1 is 2; an exponent is at most 1
+skin(of, circuit='R0-p(R1,CPE1)', prior={'alpha_1': (2.0, 0.1)}) -> an exponent is at most 1
 etid.identify_skin(of.alone, circuit='auto', fixed={'r_s': 33000.0})
     -> r_s is known, but ParallelRC and Resistor have no
 etid.select_circuit(of.alone, fixed={'r_s': 33000.0})
@@ -87,6 +89,7 @@ etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 0.0, 3.0]) -> impedance is 0
 dataclasses.replace(of.fit, method='output_error').posterior(of.skin, of.driver)
     -> the method maximum_likelihood
 of.fit.profile('cp') -> 'cp' is no element of SkinRC
+dataclasses.replace(of.fit).profile('c_p') -> in fit\.profile\(recording, driver\)
 of.fit.posterior(draws=0) -> at least 1
 of.batch.posterior(of.skin, of.driver) -> take one of them
 dataclasses.replace(of.fit, cov=np.full((3, 3), np.nan)).posterior(of.skin, of.driver)
