@@ -30,7 +30,6 @@ from .estimators.steiglitz_mcbride.estimator import EquationError as EquationErr
 from .estimators.steiglitz_mcbride.estimator import SteiglitzMcBride as SteiglitzMcBride
 from .files.exporting import export_circuit as export_circuit
 from .files.exporting import export_fits as export_fits
-from .files.exporting import export_study as export_study
 from .files.folder import import_folder as import_folder
 from .files.importing import import_file as import_file
 from .files.spectra import read_impedance as read_impedance

@@ -39,7 +39,7 @@ COMMANDS = {
     "check": ("check", "list the faults of a file of recordings, field by field"),
     "fit": ("fit", "identify the drivers and the loads of a file of recordings"),
     "report": ("report", "write a report about a file of fits: one HTML page"),
-    "export": ("exporting", "convert fits or recordings into files for other programs"),
+    "export": ("exporting", "convert fits into files for other programs"),
     "merge": (
         "merging",
         "write the recordings of several files into one file, each in a group of its own",

@@ -1,7 +1,6 @@
 """Tolerances of the instrument: in the standard errors, in a budget, and in files."""
 
 import dataclasses
-import datetime
 import functools
 from typing import Any
 
@@ -36,7 +35,6 @@ GAIN = etid.Instrument(gain=1e-3)
 ALL = etid.Instrument(gain=2e-3, r_load=2e-3, c_load=1e-12, crosstalk=2e-3, capacitance=2e-12)
 DRAWS = 40
 STUDIES = 16  # of ten fits each
-SINCE = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 CHARGE = 1e-7  # [C] of the size of a phase
 NORMAL_95 = scipy.stats.norm.ppf(0.975)
 
@@ -257,7 +255,7 @@ def test_an_instrument_is_a_field_of_the_calibrations(tmp_path):
     assert again.instrument.stored() == {"gain": 1e-3}
 
 
-def test_a_file_with_an_instrument_is_checked_exported_and_fitted_otherwise(tmp_path, capsys):
+def test_a_file_with_an_instrument_is_checked_and_fitted_otherwise(tmp_path, capsys):
     calibration, skin = exact()
     file = tmp_path / "study.h5"
     etid.Study.from_recordings([calibration.replace(instrument="delay=5ns"), skin]).write(file)
@@ -269,8 +267,6 @@ def test_a_file_with_an_instrument_is_checked_exported_and_fitted_otherwise(tmp_
     with etid.read(file) as study:
         fits = etid.identify_jointly(study, instrument=GAIN)  # what is passed counts
         assert fits.fits.verdicts == ["successful"]
-        etid.export_study(file, tmp_path / "study.nwb", session_start=SINCE)
-    assert (tmp_path / "study.nwb").exists()
 
 
 @pytest.mark.parametrize("resistors", [(R_LOAD,), (R_LOAD, 21.62e3)])

@@ -60,7 +60,7 @@ def table_of_tests():
 
 PROGRAMS = (
     "waveform", "design", "own_circuit", "own_solver", "own_prior", "profile", "hierarchy",
-    "batches", "correct_driver", "pulse", "any_record",
+    "batches", "correct_driver", "pulse", "any_record", "export_nwb",
 )  # fmt: skip
 
 
