@@ -137,9 +137,7 @@ A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Key
   pulses, the name of a trigger channel at the rising edges of the trigger. A trial then has the
   pulses from one edge to the next, up to the first pause.
 - `electrode`: as below; and where the electrodes of an array fire in turn within one long record,
-  a list of their names in this order (with `split` by pauses or by a trigger), or a name with the
-  channel of the number in braces, as in `split = "which"` and `electrode = "E{which}"`: a part has
-  the pulses while the value of `which` is the same. Each electrode then becomes the recordings
+  a list of their names in this order, with `split`. Each electrode then becomes the recordings
   `path/E7/0`, `path/E7/1`, ….
 - `path` of the recording in the etid file. Several trials become `path/0`, `path/1`, …. Without a
   path, a single `[[recording]]` becomes `loaded/0`, …, or with `r_load` `calibration/0`, ….
