@@ -238,9 +238,23 @@ v_out = {channel = "channel 0", rows = [1, 2]}
 
 ### NumPy
 
-A `.npz` archive with these arrays needs no mapping: the converter codes `adc_th` and `adc_out`
-(trial, time) and `adc_ref` (resistor, time), and the numbers `R_ref`, `fs`, `f0`, `lsb` and
-`scale`. All calibrations then share the first row of `adc_th`.
+```toml
+# Converter codes (trial, time): 100 of them are 1 V at the terminal.
+sample_rate = 200e3
+pulse_rate = 60.0
+scale = 100.0
+v_th = {channel = "open", unit = "V"}
+
+[[recording]]
+path = "calibration/98k8"
+r_load = 98.8e3
+v_out = {channel = "resistor", unit = "V"}
+
+[[recording]]
+path = "loaded"
+calibration = "calibration/98k8"
+v_out = {channel = "skin", unit = "V"}
+```
 """
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import etid
+from benchmarks.spice import imported
 from etid.identify.planning import explained
 from etid.recordings.causes import why_misaligned
 from etid.recordings.inspection import SHORTEST
@@ -60,12 +60,11 @@ def test_any_load_passes(load, jitter, snr_db, seed):
     assert preflight(simulate(load, seed, snr_db=snr_db, trigger_jitter_rms=jitter)) is None
 
 
-def test_reference_recordings_pass_but_the_clipped_ones(reference_data, tmp_path):
+def test_reference_recordings_pass_but_the_clipped_ones(reference_data):
     folder = reference_data("spice_recordings")
     refused = {}
     for name in json.loads((folder / "truth.json").read_text())["scenes"]:
-        etid.import_file(folder / f"{name}.npz", tmp_path / f"{name}.h5")
-        with etid.read(tmp_path / f"{name}.h5") as study:
+        with imported(folder / f"{name}.npz") as study:
             names = {preflight(study[path]) for path in study} - {None}
         if names:
             refused[name] = names
