@@ -60,7 +60,7 @@ CASES = {
     "excitations": (
         "--draws 2 --workers 1 --folder {}", "excitations.csv", "record current, held  fits 2",
     ),
-    "fuzz": ("--files 3 --kind csv --output {}/f.json", "f.json", "0 faults in 3 files"),
+    "fuzz": ("--files 3 --kind csv", "", "wrong error: 0.00 %"),
     "inexact": (
         "--drivers 1 --snr-db 60 --sizes 0.002 --driver-sizes 0.005 --lengths 1 --workers 1", "",
         "δ of Z_th 0.50%, length 1, damp: within 1.96 ±",
