@@ -1,6 +1,7 @@
 """Damaged files end in an answer or in one error of etid's own."""
 
 import re
+from typing import Any
 
 import h5py
 import numpy as np
@@ -116,7 +117,8 @@ def test_depth_and_links_have_limits(texts, change, message):
 
 def test_a_damaged_chunk_costs_its_own_recording(texts):
     """Its checksum no longer fits, as after a bad sector; that is seen when samples are read."""
-    with h5py.File(texts) as file:
+    with h5py.File(texts) as opened:
+        file: Any = opened
         codes = file["s01/dry/v_out"][()]
     offset = stored_again(texts, data=codes, chunks=codes.shape, fletcher32=True)
     assert offset is not None

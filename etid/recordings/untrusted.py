@@ -101,7 +101,7 @@ def guarded(path: str, **options: Any) -> Iterator[h5py.File]:
 
 def attribute(owner: h5py.HLObject, name: str) -> Any:
     """Value of an attribute; bytes that are no UTF-8 could not be written again."""
-    value = owner.attrs[name]
+    value: Any = owner.attrs[name]
     several = isinstance(value, np.ndarray) and value.dtype.hasobject
     return np.frompyfunc(_clean, 1, 1)(value) if several else _clean(value)
 
