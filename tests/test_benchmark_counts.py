@@ -6,6 +6,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import scipy.stats
 
 import etid
 from benchmarks import instruments, perturbations, speed_accuracy, which
@@ -24,7 +25,7 @@ from benchmarks.perturbation_list import (
     pair,
 )
 from benchmarks.perturbed_study import both, undisturbed
-from benchmarks.rates import COVERED, clopper_pearson, rate
+from benchmarks.rates import COVERED, LEVEL, clopper_pearson, median_interval, rate
 from benchmarks.runner import Target, report
 from etid.simulation import scenes
 from etid.simulation.scenes import Scene, Trial
@@ -136,6 +137,34 @@ def test_a_target_whose_scatter_touches_its_limits_is_missed_all_the_same(value,
     assert (", missed" in str(target)) == bool(said)
     assert str(target).endswith(said)
     assert report([target]) == target.met
+
+
+@pytest.mark.parametrize(("draws", "ends"), [(5, None), (6, (0, 5)), (100, (39, 60))])
+def test_a_median_has_an_interval_only_if_it_is_one(draws, ends):
+    found = median_interval(np.arange(float(draws))[::-1])
+    assert np.isnan(found).all() if ends is None else found == ends
+    if ends is not None:  # so many of the draws are below the median of the population
+        below = scipy.stats.binom(draws, 0.5)
+        assert below.cdf(ends[1]) - below.cdf(ends[0]) >= LEVEL
+
+
+def test_a_rival_that_was_not_run_is_not_one_without_an_answer(tmp_path):
+    absent = speed_accuracy.Result("FFT, impedance.py", "rival", (), missing="not installed")
+    failed = Answer("Octave arx", 0, "skin/01", "refused", NOTHING, NOTHING, NOTHING)
+    rows = [
+        {"scene": "dry", "estimator": of.estimator, "mode": of.mode, "draws": len(of.answers)}
+        | {**of.row(), "ms": np.nan, "on_front": False}
+        for of in (
+            absent,
+            speed_accuracy.Result("Octave arx", "rival", (failed,)),
+            speed_accuracy.Result("default", "alone", (failed,)),
+        )
+    ]
+    assert np.isnan([rows[0]["error"], rows[0]["none"]]).all()
+    assert (rows[1]["error"], rows[1]["none"]) == (np.inf, 1.0)
+    speed_accuracy.chart(rows, tmp_path / "chart.svg")
+    text = (tmp_path / "chart.svg").read_text()
+    assert "dry (not run: impedance.py; no answer: arx, etid)" in " ".join(text.split())
 
 
 def test_the_readme_has_the_table_of_the_last_results():
