@@ -197,7 +197,7 @@ def rows(plan: Plan) -> Iterator[dict[str, Any]]:
             yield _row(plan, f"read: {what}", layout, 1, found)
         usual = layout == "contiguous"
         for method in plan.methods if usual else plan.methods[-1:]:
-            for workers in WORKERS if usual else (1,):
+            for workers in WORKERS if usual or layout == "groups" else (1,):
                 found = measured(plan.folder, fit_job(plan, layout, method, workers))
                 yield _row(plan, f"fit: {method or 'default'}", layout, workers, found)
 
