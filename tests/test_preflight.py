@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import etid
@@ -46,6 +46,7 @@ def test_coarse_converters_and_every_rate_pass(bits, sample_rate):
         assert preflight(one.replace(adc_range=None)) is None
 
 
+@settings(max_examples=15)
 @given(
     load=st.one_of(
         st.builds(SkinLoad, st.floats(1e3, 1e5), st.floats(1e4, 1e6), st.floats(30e-12, 2e-9)),
