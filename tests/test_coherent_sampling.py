@@ -76,7 +76,7 @@ def test_aliases_behind_a_filter_are_not_larger_than_estimated(rate, pulses, loa
     """Nor are they more than 20 times smaller where they matter most, at the highest harmonics."""
     size = round(rate / pulses)
     half = (size - 1) // 2
-    for number in range(10):
+    for number in range(4):
         of = scene(number, rate=rate, pulses=pulses).waveform()
         x, k = of.v_th, np.round(of.f / pulses).astype(int)
         if load != "open":

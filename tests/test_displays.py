@@ -1,6 +1,8 @@
 """The example of a stream, which `etid simulate --stream` writes and `etid live --file` plays."""
 
 import json
+import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -85,3 +87,6 @@ def test_the_command_plays_it_to_its_end(written, capsys):
     told = json.loads(capsys.readouterr().out)
     counts = {"pulses": PULSES, "incomplete": 0, "late": 0, "pauses": 0, "stopped": False}
     assert told == {"command": "live", "status": 0, "source": stream, **counts}
+    page = (pathlib.Path(__file__).parents[1] / "docs" / "command_line.md").read_text("utf-8")
+    [keys] = re.findall(r"^\| `live` \| (.*) \|$", page, flags=re.MULTILINE)
+    assert told.keys() - {"command", "status"} <= set(re.findall(r"`(\w+)`", keys))
