@@ -342,19 +342,20 @@ def test_its_size_is_that_of_the_restricted_likelihood():
     of = precision[None], zero, np.array([left]), HARMONICS
     found = restricted(paired(rows)[None], paired(both)[None], *of)
 
-    def value(covariance):
-        whole = paired(both)
-        cov = np.eye(2 * half) + whole.T @ np.kron(np.eye(2), covariance) @ whole
-        left_side = paired(j) @ np.linalg.inv(cov)
+    def value(of_gains):
+        cov = np.eye(2 * half) + of_gains
+        inverse = np.linalg.inv(cov)
+        left_side = paired(j) @ inverse
         expected = left_side @ paired(j).T + np.diag(precision)
         told = left_side @ paired(y)
-        squares = paired(y) @ np.linalg.inv(cov) @ paired(y) - told @ np.linalg.solve(
-            expected, told
-        )
+        squares = paired(y) @ inverse @ paired(y) - told @ np.linalg.solve(expected, told)
         return np.linalg.slogdet(cov)[1] + np.linalg.slogdet(expected)[1] + squares
 
-    sizes = [(left * level) ** 2 * kernel for kernel in kernels(HARMONICS) for level in LEVELS]
-    values = np.array([value(one) for one in sizes])
+    whole = paired(both)
+    every = [(of, whole.T @ np.kron(np.eye(2), of) @ whole) for of in kernels(HARMONICS)]
+    squares = (left * np.array(LEVELS)) ** 2
+    sizes = [square * kernel for kernel, _ in every for square in squares]
+    values = np.array([value(square * of_gains) for _, of_gains in every for square in squares])
     weight = np.exp(-0.5 * (values - values.min()))
     expected = np.tensordot(weight / weight.sum(), np.array(sizes), 1)
     # The functions of a kernel leave a part of its variance.
