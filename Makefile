@@ -26,7 +26,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo test test-portable outputs slow ranking notebooks docs wheel-test lint types clean
 
 demo: .venv/package
-	$(BIN)/python -m etid.paper.demo demo/
+	$(BIN)/python -m benchmarks.paper.demo demo/
 
 test: .venv/tools
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
@@ -42,7 +42,7 @@ outputs: .venv/tools
 test-portable: .venv/tools
 	XLA_FLAGS=--xla_cpu_max_isa=SSE4_2 OPENBLAS_CORETYPE=Nehalem $(BIN)/python -m pytest \
 		--numprocesses auto --dist loadfile -m "stored and not slow" \
-		$$(grep -lE "kept_numbers|import printed|, printed" tests/test_*.py)
+		$$(grep -rlE "kept_numbers|import printed|, printed" tests --include "test_*.py")
 
 slow: .venv/tools
 	$(BIN)/python -m pytest -m slow --numprocesses auto --dist loadfile

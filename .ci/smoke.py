@@ -86,6 +86,7 @@ def on_the_command_line(folder):
     assert "--force" in command("fit", study, "-o", fits, status=1)["error"]  # it exists
     wrong = subprocess.run([PROGRAM, "fit"], capture_output=True, check=False)
     assert wrong.returncode == 2
+    subprocess.run([PROGRAM.with_name("etid-live"), "--help"], capture_output=True, check=True)
 
 
 def main():

@@ -19,7 +19,11 @@ NAMES = (
     *("referee", "fuzz", "mutation", "live", "instruments", "directions", "inexact", "real"),
     *("excitations", "spectrum_peers"),
 )
-PLACES = {"rivals": "rivals.table"}  # modules of other names
+PLACES = {  # modules of other names
+    "paper": "paper.causes",
+    "rivals": "rivals.table",
+    **{name: f"display.{name}" for name in ("online", "control", "live")},
+}
 
 
 def asked(argv: Sequence[str] | None = None) -> argparse.Namespace:

@@ -80,7 +80,7 @@ def against_samples(sizes: Sequence[int]) -> Iterator[Row]:
 
 def against_lanes(counts: Sequence[int]) -> Iterator[Row]:
     """Seconds per lane of a batch, from recordings in memory to fits; then solvers alone."""
-    of, method = problem(5_000, 16, 100e3), "equation_error"
+    of, method = problem(5_000, 16, 100e3), "steiglitz_mcbride(iterations=1)"
     quick = etid.identify_driver(of.study["calibration/0"], method=method, throw=False)
 
     def fits(name: str, driver: etid.Driver) -> Callable[[np.ndarray], Any]:

@@ -14,16 +14,11 @@ import scipy.stats
 
 import etid
 from benchmarks import perturbed_study as lab
+from benchmarks.estimators import load_behind
 from benchmarks.runner import WORKERS, Target, each, option, report
-from etid.circuits.circuit import SkinRC
 from etid.circuits.directions import DIRECTIONS, FALSE_ALARMS
-from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood.rows import loads_of, source_of
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.fitting import known_of
 from etid.likelihood.fit import fit
 from etid.likelihood.starts import starts
-from etid.recordings.preflight import Inspected
 
 FIRST = 3000  # number of the first driver
 RARE = 1e-3  # probability that chance explains so many refusals
@@ -44,9 +39,7 @@ def scores_of(number: int, snr_db: float, parts: float) -> dict[str, dict[str, l
         return {}
     found = {}
     for one in of.loaded.recordings():
-        lane = Harmonics.of(Inspected.of(one))
-        known = known_of(lane, driver, False, MAXIMUM_LIKELIHOOD)
-        load = loads_of([lane], source_of(known), SkinRC(), None, None)
+        load = load_behind(one, driver)
         scores = fit(load, starts(load)).tested
         found[str(one.path)] = {
             name: [np.nan_to_num(of.z[0]).tolist(), DIRECTIONS[name].seen(*of[:3])[0].tolist()]

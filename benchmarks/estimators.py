@@ -19,7 +19,12 @@ from jaxtyping import Bool, Float
 import etid
 from benchmarks.rates import Rate, rate
 from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood.rows import loads_of, source_of
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named, names
+from etid.identify.fitting import known_of
+from etid.likelihood.search import Load
+from etid.recordings.preflight import Inspected
 from etid.results.driver import Order
 from etid.results.verdicts import USABLE, counted
 
@@ -136,6 +141,13 @@ class Drivers:
                 self.known[key] = None
             self.times.setdefault(kind, []).append(time.perf_counter() - begin)
         return self.known[key]
+
+
+def load_behind(recording: etid.Recording, driver: etid.Driver) -> Load:
+    """The likelihood of one skin, as the default method has it."""
+    lane = Harmonics.of(Inspected.of(recording))
+    known = known_of(lane, driver, False, MAXIMUM_LIKELIHOOD)
+    return loads_of([lane], source_of(known), SkinRC(), None, None)
 
 
 def method_of(name: str) -> str | None:

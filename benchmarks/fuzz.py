@@ -1,231 +1,150 @@
-"""Damaged files: crashes, hangs, memory and errors that are not etid's own.
+"""Damaged files: how often one crashes or stops its reader, or ends in a wrong error.
 
-Child processes read thousands of them each; one that takes longer than `--limit`, dies, or
-allocates more than a gigabyte is counted and named by kind and seed, and `--kind KIND --first SEED
---files 1` repeats it. What may come out is an answer or one `etid.RecordingError`.
+A child process damages good files of seven kinds, and reads them. What may come out is an answer or
+one `etid.RecordingError`. `--kind KIND --first SEED --files 1` repeats a file.
 """
 
 import argparse
 import collections
-import faulthandler
-import json
-import math
 import multiprocessing
-import os
 import pathlib
 import resource
-import shutil
 import signal
 import tempfile
-import time
-import traceback
-import warnings
-from collections.abc import Iterator
 from multiprocessing.connection import Connection
-from typing import Any
 
-import jax
+import h5py
 import numpy as np
+import scipy.io
 
 import etid
-from benchmarks import specimens
-from benchmarks.damage import one_of
+from benchmarks.rates import Rate, clopper_pearson
 from benchmarks.runner import option, show
+from benchmarks.specimens import SKIN, study_fits
+from etid.recordings import untrusted
+from etid.simulation.scenes import ResistorLoad, Scene, SkinLoad, Trial
 
-MEMORY = 1 << 30  # bytes that a process may have in memory
-SAFETY = 4 << 30  # bytes of addresses beside those after the imports, for the sake of this machine
-PATIENCE = 60  # a file may take so many times the limit if others use the processor meanwhile
-START = 120.0  # seconds until a child has made its good files, or damaged one
-SHARES = {"recordings": 8, "fits": 5, "mapping": 2, "csv": 1, "npz": 1, "matlab": 2,
-          "matlab5": 1, "tdms": 1, "abf": 1}  # fmt: skip
-FINE = ("read", "refused")
-CONTEXT = multiprocessing.get_context("spawn")
-
+KINDS = ("etid", "h5py", "fits", "csv", "npz", "mat", "mat5")  # by turns
+SECONDS, MEMORY = 5, 4 << 30  # of the processor for one file; bytes of a process
+TARGET = 1 / 500  # of the files may crash or stop their reader; none may end in a wrong error
+SPECIAL = (0, 1, 255, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1)
+MAPPING = {"sample_rate": 2e5, "pulse_rate": 60.0, "scale": 0.0535}
+MAPPING |= {to: {"channel": of, "unit": "V"} for to, of in (("v_th", "open"), ("v_out", "skin"))}
 
 OPTIONS = (
     option("--files", default=2000),
     option("--first", default=0, help="first seed"),
-    option("--kind", choices=SHARES, help="default: all, by turns"),
-    option("--limit", default=5.0, help="seconds of the processor for one file"),
-    option("--output", type=pathlib.Path, help="JSON file"),
+    option("--kind", choices=KINDS, help="default: all, by turns"),
+    option("--no-guard", default=False, help="without the check of heaps"),
 )
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    started = time.perf_counter()
     seeds = range(arguments.first, arguments.first + arguments.files)
-    cases = [(arguments.kind or kind_of(seed), seed) for seed in seeds]
+    cases = [(arguments.kind or KINDS[seed % len(KINDS)], seed) for seed in seeds]
     counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
-    faults: list[dict[str, Any]] = []
-    slowest = largest = 0.0
-    for found in run(cases, arguments.limit):
-        counts[found["kind"]][found["outcome"]] += 1
-        slowest = max(slowest, found["seconds"])
-        largest = max(largest, found["memory"])
-        if found["outcome"] not in FINE:
-            faults.append(found)
-            print(f"{found['kind']} {found['seed']}: {found['outcome']}\n{found['detail']}\n")
-    for kind, own in counts.items():
-        show({"kind": kind, "files": own.total(), **own})
-    print(
-        f"{len(faults)} faults in {len(cases)} files; slowest {slowest:.2f} s, "
-        f"peak memory {largest / 2**20:.0f} MB, {time.perf_counter() - started:.0f} s in all"
-    )
-    if arguments.output is not None:
-        content = {"cases": len(cases), "counts": counts, "faults": faults, "slowest": slowest,
-                   "memory": largest}  # fmt: skip
-        arguments.output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    return not faults
-
-
-def kind_of(seed: int) -> str:
-    """Which kind of file a seed is for, if none is asked for."""
-    turns = [kind for kind, share in SHARES.items() for _ in range(share)]
-    return turns[seed % len(turns)]
-
-
-def run(cases: list[tuple[str, int]], limit: float) -> Iterator[dict[str, Any]]:
-    """The outcomes of all cases, from as many child processes as it takes."""
-    left = collections.deque(cases)
-    while left:
-        with _Child() as child:
-            while left and child.alive:
-                kind, seed = left.popleft()
-                yield child.outcome(kind, seed, limit)
-
-
-class _Child:
-    """A process that reads one damaged file after the other."""
-
-    def __enter__(self) -> "_Child":
-        self.folder = pathlib.Path(tempfile.mkdtemp(prefix="etid-fuzz-"))
-        self.log, (self.pipe, theirs) = self.folder.with_suffix(".log"), CONTEXT.Pipe()
-        self.process = CONTEXT.Process(target=child, args=(theirs, self.folder, self.log))
-        self.process.start()
+    while cases:
+        pipe, theirs = multiprocessing.Pipe()
+        spawn, given = multiprocessing.get_context("spawn"), (theirs, cases, arguments.no_guard)
+        process = spawn.Process(target=child, args=given)
+        process.start()
         theirs.close()
-        self.alive = True
-        if self._answer(START) is None:
-            raise RuntimeError(f"no child process could be started:\n{self._last_words()}")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.join()
-        self.pipe.close()
-        self.log.unlink(missing_ok=True)
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-    def outcome(self, kind: str, seed: int, limit: float) -> dict[str, Any]:
-        """What comes of one file."""
-        found = {"kind": kind, "seed": seed, "seconds": limit, "memory": 0.0, "detail": ""}
-        self.pipe.send((kind, seed))
-        # What a file that has once been damaged takes to be damaged is not the reader's time.
-        began = self._answer(PATIENCE * START, START) is not None
-        answer = self._answer(PATIENCE * limit, limit) if began else None
-        if answer is not None:
-            return found | answer
-        hangs, pid, self.alive = self.alive, self.process.pid, False
-        if hangs and pid is not None:
-            os.kill(pid, signal.SIGUSR1)  # faulthandler says where it is
-            time.sleep(0.3)
-            self.process.kill()
-        self.process.join()
-        outcome = "hang" if hangs else f"crash, status {self.process.exitcode}"
-        return found | {"outcome": outcome, "detail": self._last_words()}
-
-    def _answer(self, limit: float, work: float = math.inf) -> dict[str, Any] | None:
-        """The next one; None if there is none in this time, or in this time of the processor."""
-        end, begun = time.monotonic() + limit, self._worked()
-        try:
-            while not self.pipe.poll(0.2):
-                if time.monotonic() > end or self._worked() - begun > work:
-                    return None
-            return self.pipe.recv()
-        except (EOFError, ConnectionError):  # it has died
-            self.alive = False
-            return None
-
-    def _worked(self) -> float:
-        """Seconds of the processor that the child has had."""
-        stat = pathlib.Path(f"/proc/{self.process.pid}/stat").read_text("ascii")
-        return sum(map(int, stat.rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
-
-    def _last_words(self) -> str:
-        return self.log.read_text(errors="replace")[-4000:] if self.log.exists() else ""
+        while cases:
+            kind, seed = cases.pop(0)
+            try:
+                outcome = pipe.recv()
+            except EOFError:
+                process.join()
+                outcome = "hang" if process.exitcode == -signal.SIGXCPU else "crash"
+            counts[kind][outcome] += 1
+            if outcome not in ("read", "refused"):
+                print(f"{kind} {seed}: {outcome}")
+            if process.exitcode is not None:
+                break
+    total = sum(counts.values(), collections.Counter[str]())
+    for kind, own in {**counts, "all": total}.items():
+        show({"kind": kind, "files": own.total(), **own})
+    lost, n = total["hang"] + total["crash"], total.total()
+    wrong = n - lost - total["read"] - total["refused"]
+    for name, count, most in (("crash or hang", lost, TARGET), ("wrong error", wrong, 0.0)):
+        print(f"{name}: {Rate(count / n, *clopper_pearson(count, n), n)}, at most {most:.1%}")
+    return lost <= TARGET * n and wrong == 0
 
 
-def damage(path: pathlib.Path, kind: specimens.Kind, seed: int) -> pathlib.Path:
-    """Write a damaged file of this kind and seed into a folder."""
-    rng = np.random.default_rng(seed)
-    name = path / f"{seed}{kind.suffix}"
-    name.write_bytes(one_of(rng, kind.good))
-    kind.damage(name, rng)
-    return name
+def child(pipe: Connection, cases: list[tuple[str, int]], no_guard: bool) -> None:
+    """Damage and read files; what comes of each goes into the pipe."""
+    if no_guard:
+        untrusted.Guarded._follow = lambda self, heap: None
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    with tempfile.TemporaryDirectory() as folder:
+        good = good_files(pathlib.Path(folder))
+        for kind, seed in cases:
+            most = int(sum(resource.getrusage(resource.RUSAGE_SELF)[:2])) + SECONDS + 1
+            resource.setrlimit(resource.RLIMIT_CPU, (most, resource.RLIM_INFINITY))
+            pipe.send(judge(pathlib.Path(folder), kind, good[kind], seed))
 
 
-def judge(path: pathlib.Path, kind: specimens.Kind, seed: int) -> tuple[str, str]:
-    """What comes of reading a file: `read`, `refused`, or what is wrong about it, and the text."""
+def judge(folder: pathlib.Path, kind: str, good: bytes, seed: int) -> str:
+    """What comes of a damaged file: `read`, `refused`, or the name of a wrong error."""
+    suffix = ".h5" if kind in KINDS[:3] else f".{kind.rstrip('5')}"
+    path = folder / f"{seed}{suffix}"
+    path.write_bytes(damaged(good, np.random.default_rng(seed)))
     try:
-        kind.use(path, seed)
+        if kind == "fits":
+            str(etid.Fits.read(path))
+        elif suffix == ".h5":
+            etid.check(path)
+            with etid.read(path) as study:
+                list(study.recordings())
+        else:
+            etid.import_file(path, folder / "out.h5", MAPPING)
     except etid.RecordingError as error:
-        hidden = [one for one in _chain(error) if isinstance(one, MemoryError | Warning)]
-        if hidden:
-            return type(hidden[0]).__name__, "".join(traceback.format_exception(error))
-        # One line that says which file.
-        place = path.name in str(error) or path.stem in str(error)
-        return ("refused", str(error)) if place else ("unnamed", str(error))
-    except BaseException as error:
-        return type(error).__name__, "".join(traceback.format_exception(error)[-12:])
-    return "read", ""
+        return "refused" if path.stem in str(error) else "unnamed"
+    except Exception as error:
+        return type(error).__name__
+    return "read"
 
 
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    """An error and those of which it came."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
+def damaged(good: bytes, rng: np.random.Generator) -> bytes:
+    """Flip, overwrite, clear, move, delete or cut bytes, one to four times; often early ones."""
+    data = bytearray(good)
+    for _ in range(int(rng.integers(1, 5))):
+        near = min(len(data), 4096) if rng.random() < 0.5 else len(data)
+        size, long = 2 ** int(rng.integers(4)), int(rng.integers(1, 512))
+        at, other = (int(rng.integers(most + 1)) // size * size for most in (near, len(data)))
+        value = SPECIAL[int(rng.integers(len(SPECIAL)))] if rng.random() < 0.5 else other
+        number = (value % 256**size).to_bytes(size, "little")
+        changes = (
+            *((1, rng.bytes(1)), (size, number), (long, bytes(long))),
+            *((long, data[other : other + long]), (long % 64, b""), (len(data), b"")),
+        )
+        count, new = changes[int(rng.choice(6, p=[0.3, 0.3, 0.1, 0.15, 0.1, 0.05]))]
+        data[at : at + count] = new
+    return bytes(data)
 
 
-def _status(name: str) -> int:
-    """A number of /proc/self/status [byte]."""
-    text = pathlib.Path("/proc/self/status").read_text("ascii")
-    return 1024 * int(text.split(f"{name}:")[1].split()[0])
-
-
-def child(pipe: Connection, folder: pathlib.Path, log: pathlib.Path) -> None:
-    """Take cases from a pipe, and give what comes of them."""
-    with log.open("w") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-    jax.config.update("jax_enable_x64", True)
-    faulthandler.register(signal.SIGUSR1, all_threads=True)
-    faulthandler.enable()
-    warnings.simplefilter("error")
-    known = specimens.kinds()
-    limit = _status("VmSize") + SAFETY
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-    pipe.send({})
-    warm: set[str] = set()
-    while True:
-        name, seed = pipe.recv()
-        kind = known[name]
-        if name not in warm and seed % specimens.PAGES == 0:  # what it compiles is kept
-            good = folder / f"good{kind.suffix}"
-            good.write_bytes(kind.good[0])
-            judge(good, kind, seed)
-            warm.add(name)
-        path = damage(folder, kind, seed)
-        pipe.send({})
-        pathlib.Path("/proc/self/clear_refs").write_text("5", "ascii")  # the peak from here on
-        started = time.process_time()
-        outcome, detail = judge(path, kind, seed)
-        seconds = time.process_time() - started
-        for left in folder.iterdir():
-            left.unlink()
-        memory = _status("VmHWM")
-        if memory > MEMORY and outcome in FINE:
-            outcome, detail = "memory", f"{memory >> 20} MB. {detail}"
-        said = {"outcome": outcome, "detail": detail, "seconds": seconds, "memory": memory}
-        pipe.send(said)
+def good_files(folder: pathlib.Path) -> dict[str, bytes]:
+    """The bytes of a good file of each kind."""
+    names = ("ours.h5", "theirs.h5", "fits.h5", "a.csv", "a.npz", "mat.h5", "a.mat")
+    ours, theirs, fits, table, npz, mat, mat5 = files = [folder / name for name in names]
+    trials = tuple(Trial(f"s01/dry/{i}", SkinLoad(**SKIN), subject="s01") for i in range(3))
+    known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+    Scene(trials, known, samples=3400).simulate(seed=1).write(ours)
+    with h5py.File(ours) as source, h5py.File(theirs, "w") as target:
+        for name in source:
+            source.copy(name, target)
+        places = ["/"]
+        source.visit(places.append)
+        for place in places:  # texts of variable length, as h5py writes them by itself
+            for name, value in source[place].attrs.items():
+                text = np.asarray(value).dtype.kind == "S"
+                target[place].attrs[name] = value.astype(object) if text else value
+    study_fits().write(fits)
+    th, out = np.random.default_rng(7).normal(size=(2, 400))
+    np.savetxt(table, np.stack([th, out], 1), "%.6f", ",", header="open,skin", comments="")
+    np.savez_compressed(npz, open=th, skin=out)
+    cells = np.array([th, {"s": out}], object)
+    scipy.io.savemat(mat5, {"open": th, "skin": out, "cells": cells})
+    with h5py.File(mat, "w", userblock_size=512) as file:
+        file["open"], file["skin"] = th[:, None], out[:, None]
+    return {kind: path.read_bytes() for kind, path in zip(KINDS, files, strict=True)}

@@ -11,19 +11,16 @@ calibrations and to exact skin. Their order is 5, or 7 where 5 is too low.
 import argparse
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import jax
 import numpy as np
 
 import etid
 from benchmarks import perturbed_study as lab
+from benchmarks.estimators import load_behind
+from benchmarks.rates import NORMAL_95
 from benchmarks.runner import WORKERS, Target, each, option, report
-from etid.circuits.circuit import SkinRC
-from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood.rows import loads_of, source_of
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.fitting import known_of
 from etid.likelihood.approximate import extended, with_delta
 from etid.likelihood.approximate_driver import nearest, with_departure
 from etid.likelihood.calibrations import Calibrations
@@ -31,7 +28,6 @@ from etid.likelihood.discrepancy import nodes
 from etid.likelihood.driver import minimum as minimum_of_driver
 from etid.likelihood.search import minimum
 from etid.likelihood.starts import starts
-from etid.recordings.preflight import Inspected
 from etid.results.driver import HarmonicDriver
 from etid.simulation.transformer import Impedance, ResistorLoad, TransformerDriver
 
@@ -41,6 +37,7 @@ RESISTORS = 98.8e3, 21.62e3, 216.6e3, 55.2e3  # [ohm]
 ORDERS = 5, 7
 BAND = 30.0, 1e5  # [Hz] of δ; it is constant beyond
 POINTS = 100  # of δ between its ends
+X = np.linspace(np.log(BAND[0]), np.log(BAND[1]), POINTS)  # ln f of δ
 FIRST = 7000  # number of the first driver
 
 MOST_ERROR = 1.3  # rms error, relative to that of a fit that knows the covariance of δ
@@ -61,6 +58,13 @@ OPTIONS = (
 def covariance(x: np.ndarray, size: float, length: float) -> np.ndarray:
     """That of δ between values of ln f."""
     return size**2 * np.exp(-0.5 * ((x[:, None] - x) / length) ** 2)
+
+
+def drawn(rng: np.random.Generator, length: float) -> np.ndarray:
+    """δ of size 1 at `X`."""
+    root = np.linalg.cholesky(covariance(X, 1.0, length) + 1e-10 * np.eye(POINTS))
+    real, imaginary = root @ rng.standard_normal((2, POINTS, 1))
+    return (real + 1j * imaginary)[:, 0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,13 +94,10 @@ class Inexact:
 def inexact(study: lab.Study, size: float, length: float) -> lab.Study:
     """The study with a δ of its own for each loaded record."""
     rng = np.random.default_rng([study.number, *b"inexact"])
-    x = np.linspace(np.log(BAND[0]), np.log(BAND[1]), POINTS)
-    root = np.linalg.cholesky(covariance(x, size, length) + 1e-10 * size**2 * np.eye(POINTS))
 
     def change(of: lab.Record) -> lab.Record:
-        real, imaginary = root @ rng.standard_normal((2, POINTS, 1))
-        (load,), delta = of.out.loads, (real + 1j * imaginary)[:, 0]
-        return lab.out(loads=(Inexact(load, of.out.driver, x, delta),))(of)
+        (load,), delta = of.out.loads, size * drawn(rng, length)
+        return lab.out(loads=(Inexact(load, of.out.driver, X, delta),))(of)
 
     return lab.trials(change)(study)
 
@@ -121,10 +122,7 @@ class InexactDriver(TransformerDriver):
 def inexact_driver(study: lab.Study, size: float, length: float, resistors: int = 2) -> lab.Study:
     """The study with a Z_th that has one δ in all its records, and with so many calibrations."""
     rng = np.random.default_rng([study.number, *b"inexact driver"])
-    x = np.linspace(np.log(BAND[0]), np.log(BAND[1]), POINTS)
-    root = np.linalg.cholesky(covariance(x, 1.0, length) + 1e-10 * np.eye(POINTS))
-    real, imaginary = root @ rng.standard_normal((2, POINTS, 1))
-    delta = (real + 1j * imaginary)[:, 0]
+    delta = drawn(rng, length)
     [first] = study.calibrations
     every = [first]
     for r_load in RESISTORS[1:resistors]:
@@ -134,7 +132,7 @@ def inexact_driver(study: lab.Study, size: float, length: float, resistors: int 
         every.append(lab.out(delay=late[1], loads=(ResistorLoad(r_load),))(one))
     usual = first.out.driver
     parts = {of.name: getattr(usual, of.name) for of in dataclasses.fields(usual)}
-    driver = InexactDriver(**parts, x=tuple(x), delta=tuple(size * delta))
+    driver = InexactDriver(**parts, x=tuple(X), delta=tuple(size * delta))
     return lab.all_records(lab.both(driver=driver))(
         dataclasses.replace(study, calibrations=tuple(every))
     )
@@ -176,21 +174,16 @@ def behind(
 
     One of the drivers knows the covariance of δ, the other is that of the same circuit without δ.
     """
-    study = inexact_driver(lab.undisturbed(number, snr_db, parts), size, length, resistors)
-    exact = inexact_driver(lab.undisturbed(number, snr_db, parts), 0.0, length, resistors)
-    of, found = study.recordings(), []
-    driver = identified(list(of.calibrations.recordings()))
-    best = knowing(driver, size, length)
-    without = identified(list(exact.recordings().calibrations.recordings()))
-    for one in of.loaded.recordings():
-        truth = np.log(study.truths[str(one.path)].low)
-        fits = [etid.identify_skin(one, each, throw=False) for each in (driver, best)]
-        fits.append(etid.identify_skin(exact.recordings()[str(one.path)], without, throw=False))
-        values = [np.asarray(fit.circuit.values()) for fit in fits]
-        errors = np.asarray(fits[0].stderr.values()) / values[0]
-        errors = errors if fits[0].usable else np.full(3, np.nan)
-        first, *others = (np.log(each) - truth for each in values)
-        found.append((first, errors, *others))
+    usual = lab.undisturbed(number, snr_db, parts)
+    studies = [inexact_driver(usual, of, length, resistors).recordings() for of in (size, 0.0)]
+    of, exact = studies
+    driver, without = (identified(list(one.calibrations.recordings())) for one in studies)
+    best, found = knowing(driver, size, length), []
+    for path in of.loaded:
+        pairs = (of[path], driver), (of[path], best), (exact[path], without)
+        fit, *others = (etid.identify_skin(*pair, throw=False) for pair in pairs)
+        logs = [np.log(np.asarray(one.circuit.values())) for one in others]
+        found.append(errors(fit, usual.truths[path], logs))
     return found
 
 
@@ -206,23 +199,24 @@ def answers(
     of = study.recordings()
     driver = etid.identify_driver(list(of.calibrations.recordings()), throw=False)
     found = []
-    for one in of.loaded.recordings():
-        truth = np.log(study.truths[str(one.path)].low)
+    for path, one in of.loaded.items():
         fit = etid.identify_skin(one, driver, throw=False)
-        values, errors = np.asarray(fit.circuit.values()), np.asarray(fit.stderr.values())
-        own = np.log(values) - truth, errors / values if fit.usable else np.full(3, np.nan)
-        others = _others(one, driver, fit, size, length)
-        found.append((*own, *(of - truth for of in others)))
+        found.append(errors(fit, study.truths[path], _others(one, driver, fit, size, length)))
     return found
+
+
+def errors(fit: etid.Fit, truth: lab.Truth, others: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Error and ± of a fit, NaN if it cannot be used, and errors of the logarithms of others."""
+    values, true = np.asarray(fit.circuit.values()), np.log(truth.low)
+    stderr = np.asarray(fit.stderr.values()) / values if fit.usable else np.full(3, np.nan)
+    return np.log(values) - true, stderr, *(of - true for of in others)
 
 
 def _others(
     one: etid.Recording, driver: etid.Driver, fit: etid.Fit, size: float, length: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Logarithms of the elements, by a fit that knows the covariance of δ, and by the noise."""
-    lane = Harmonics.of(Inspected.of(one))
-    known = known_of(lane, driver, False, MAXIMUM_LIKELIHOOD)
-    load = loads_of([lane], source_of(known), SkinRC(), None, None)
+    load = load_behind(one, driver)
     start, by_noise = starts(load)[0], minimum(load, starts(load)).q[0, :3]
     start[:, :3] = np.log(np.asarray(fit.circuit.values()))  # its own minimum is near
     load = with_delta(load, covariance(nodes(load.records.x.shape[-1]), size, length)[None])
@@ -258,7 +252,7 @@ def _asked(
         used = np.isfinite(stderr).all(-1)
         name = f"{snr_db:g} dB, δ{kind} {size:.2%}, length {length:g}, {path}"
         ratio = np.sqrt(np.mean(error[used] ** 2, 0) / np.mean(best[used] ** 2, 0))
-        covered = np.mean(np.abs(error[used]) < 1.96 * stderr[used], 0)
+        covered = np.mean(np.abs(error[used]) < NORMAL_95 * stderr[used], 0)
         print(f"{name}: {used.mean():.0%} usable; rms error "
               f"{', '.join(f'{one:.2%}' for one in np.sqrt(np.mean(error[used] ** 2, 0)))}, "
               f"{other} {', '.join(f'{one:.2%}' for one in np.sqrt(np.mean(compared ** 2, 0)))}; "

@@ -1,7 +1,7 @@
 """A file of any number of recordings, made quickly: a hundred waveforms, each time with new noise.
 
-Stacks of a thousand trials in the layouts that h5py users get, int16 as converters give them, and
-one calibration with an unloaded record of its own.
+Stacks of a thousand trials in the layouts that h5py users get, or a group for each recording; int16
+as converters give them, and one calibration with an unloaded record of its own.
 """
 
 import dataclasses
@@ -25,6 +25,7 @@ LAYOUTS: Mapping[str, Mapping[str, Any]] = {
     "contiguous": {},
     "chunked": {"chunks": True},
     "gzip": {"chunks": True, "compression": "gzip"},
+    "groups": {},
 }
 SIGNALS = ("v_th", "v_out")
 
@@ -44,12 +45,15 @@ def large_file(folder: pathlib.Path, recordings: int, layout: str) -> pathlib.Pa
     with replacing(path) as partial:
         dataclasses.replace(scene, trials=()).simulate(SEED).write(partial)  # the calibration
         with h5py.File(partial, "a", libver="v108") as file:
-            _append(file, scene, recordings, LAYOUTS[layout])
+            stack = 1 if layout == "groups" else STACK
+            _append(file, scene, recordings, stack, LAYOUTS[layout])
     return path
 
 
-def _append(file: h5py.File, scene: Scene, recordings: int, layout: Mapping[str, Any]) -> None:
-    """Write the loaded recordings, a stack at a time."""
+def _append(
+    file: h5py.File, scene: Scene, recordings: int, size: int, layout: Mapping[str, Any]
+) -> None:
+    """Write the loaded recordings, so many at a time."""
     assert scene.bits is not None
     step = scene.full_scale / 2 ** (scene.bits - 1)  # volts at the converter
     clean = dataclasses.replace(scene, snr_db=None, bits=None)
@@ -61,13 +65,15 @@ def _append(file: h5py.File, scene: Scene, recordings: int, layout: Mapping[str,
     unrounded = dataclasses.replace(scene, bits=None)
     sigma = np.float32(unrounded.waveform().sigma * scene.scale / step)
     draws = np.random.default_rng(SEED)
-    for first in range(0, recordings, STACK):
-        rows = np.arange(first, min(first + STACK, recordings))
-        group = file.create_group(f"s{first // STACK:04d}/skin")
+    for first in range(0, recordings, size):
+        rows = np.arange(first, min(first + size, recordings))
+        subject = f"s{first // STACK:04d}"
+        group = file.create_group(f"{subject}/skin/{first}" if size == 1 else f"{subject}/skin")
         group.attrs.update(kind="loaded", sample_rate=SAMPLE_RATE, pulse_rate=scene.pulse_rate)
-        group.attrs.update(subject=f"s{first // STACK:04d}", condition="skin")
+        group.attrs.update(subject=subject, condition="skin")
         for name in SIGNALS:
             noisy = sigma * draws.standard_normal((rows.size, SAMPLES), dtype=np.float32)
             noisy += codes[name][rows % len(records)]
-            stack = group.create_dataset(name, data=np.rint(noisy).astype("i2"), **layout)
+            data = np.rint(noisy[0] if size == 1 else noisy).astype("i2")
+            stack = group.create_dataset(name, data=data, **layout)
             stack.attrs.update(unit="volt", conversion=step / scene.scale)

@@ -1,7 +1,7 @@
 """The machine: where numbers come from, how times are measured, and room for compiled programs.
 
-Beside every row of a CSV stand commit, machine and versions. Times are medians on one core,
-compilation apart.
+Beside every row of a CSV stand commit, machine and versions. Times are medians of processor time on
+one core, which other work on the machine does not lengthen by much, compilation apart.
 """
 
 import contextlib
@@ -121,8 +121,8 @@ def interpreter() -> dict[str, str]:
 
 
 def import_time(module: str) -> float:
-    """Wall time [s] of importing a module in a fresh interpreter, median after a first one."""
-    code = f"import time; t = time.perf_counter(); {module}; print(time.perf_counter() - t)"
+    """Processor time [s] to import a module in a fresh interpreter, median after a first one."""
+    code = f"import time; t = time.process_time(); {module}; print(time.process_time() - t)"
     command = [sys.executable, "-c", code]
     runs = [
         subprocess.run(command, env=interpreter(), capture_output=True, check=True).stdout
@@ -132,8 +132,9 @@ def import_time(module: str) -> float:
 
 
 def median_time(call: Callable[[], Any], repeats: int) -> float:
-    """Median wall time [s] after a first call."""
-    return float(np.median([timed(call)[1] for _ in range(repeats + 1)][1:]))
+    """Median processor time [s] after a first call."""
+    times = [timed(call, time.process_time)[1] for _ in range(repeats + 1)]
+    return float(np.median(times[1:]))
 
 
 def timed(

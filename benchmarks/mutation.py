@@ -228,7 +228,8 @@ def main(arguments: argparse.Namespace, root: pathlib.Path = ROOT) -> bool:
     print(f"{len(chosen)} of {len(every)} mutants of {len(names)} modules")
     with tempfile.TemporaryDirectory() as place:
         tree = Tree(root, pathlib.Path(place))
-        tests = [f"tests/{path.name}" for path in sorted((root / "tests").glob("test_*.py"))]
+        paths = sorted((root / "tests").rglob("test_*.py"))
+        tests = [path.relative_to(root).as_posix() for path in paths]
         kept = root == ROOT  # what another tree has done is not known by this one's commit
         files = [(one,) for one in tests]
         noted = dict(each(tree.executed, files, unit="file", keep="tests" if kept else ""))

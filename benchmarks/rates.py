@@ -14,6 +14,7 @@ import numpy as np
 import scipy.stats
 
 LEVEL = 0.95
+FEWEST = 6  # values whose median has an interval: 1 − 2 · 2⁻⁶ is 97 %, 1 − 2 · 2⁻⁵ is 94 %
 OF_RUNS = 0.99
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard errors
 COVERED = (0.93, 0.97)  # part of the 95 % intervals that is to contain the truth
@@ -41,10 +42,14 @@ def clopper_pearson(events: float, trials: float) -> tuple[float, float]:
 
 
 def median_interval(values: np.ndarray) -> tuple[float, float]:
-    """The order statistics between which the median of the population lies, by the signs alone."""
+    """The order statistics between which the median of the population lies, by the signs alone.
+
+    NaN of fewer than `FEWEST` values: from the least to the largest is less than 95 % then.
+    """
+    if values.size < FEWEST:
+        return np.nan, np.nan
     below, above = scipy.stats.binom.interval(LEVEL, values.size, 0.5)  # values below the median
-    ranks = np.array([below - 1, above], int).clip(0, values.size - 1)
-    low, high = np.sort(values)[ranks]
+    low, high = np.sort(values)[[int(below) - 1, int(above)]]
     return float(low), float(high)
 
 

@@ -202,10 +202,11 @@ class Target(NamedTuple):
 
 def report(targets: Iterable[Target], path: pathlib.Path | None = None) -> bool:
     """Print numbers with their targets, and write them as CSV if asked; whether all are met."""
-    every = list(targets)
+    every = list[Target]()
+    for one in targets:
+        print(one, flush=True)
+        every.append(one)
     if path is not None:
         heads = ("quantity", "value", "least", "most")
         write_csv(path, [dict(zip(heads, one, strict=False)) for one in every])
-    for one in every:
-        print(one, flush=True)
     return all(one.met for one in every)

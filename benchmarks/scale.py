@@ -45,7 +45,7 @@ WORKERS = (1, 2)  # 1 is the process itself
 WARM = 8  # recordings that make every process compile
 PATIENCE = 0.002  # [s] between two looks at a run that is to be killed
 
-METHODS = (None, "equation_error")  # None is the default one
+METHODS = (None, "steiglitz_mcbride(iterations=1)")  # None is the default one
 OPTIONS = (
     QUICK,
     option("--recordings", default=100_000),
@@ -197,7 +197,7 @@ def rows(plan: Plan) -> Iterator[dict[str, Any]]:
             yield _row(plan, f"read: {what}", layout, 1, found)
         usual = layout == "contiguous"
         for method in plan.methods if usual else plan.methods[-1:]:
-            for workers in WORKERS if usual else (1,):
+            for workers in WORKERS if usual or layout == "groups" else (1,):
                 found = measured(plan.folder, fit_job(plan, layout, method, workers))
                 yield _row(plan, f"fit: {method or 'default'}", layout, workers, found)
 

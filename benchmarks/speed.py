@@ -5,6 +5,7 @@ Each line is a ratio of medians with its target; a missed target makes the comma
 
 import argparse
 import dataclasses
+import itertools
 import os
 import shutil
 import subprocess
@@ -17,7 +18,9 @@ import numpy as np
 import scipy.signal
 
 import etid
-from benchmarks import online, peers
+from benchmarks import peers
+from benchmarks.display import online
+from benchmarks.ladder import recorded
 from benchmarks.machine import import_time, interpreter, median_time
 from benchmarks.peers import LOAD, SAMPLES, A, B, Problem, harmonics, problem
 from benchmarks.runner import QUICK, Target, report
@@ -25,7 +28,9 @@ from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS
 
 PINNED = True
 PROCESSES = 3  # whose median counts
-BATCH = 1024  # recordings of a batch that is compiled, also of 5 000 samples
+BATCH = 1024  # recordings
+MOST = {"driver": 250.0, "skin": 20.0, f"skin, batch of {BATCH}": 3.0}  # [ms], of three periods
+MOST_OF_JOINT = 8.0  # [ms] of a trial of three periods
 OPTIONS = (QUICK,)
 
 
@@ -89,26 +94,38 @@ def from_samples(of: Problem, repeats: int) -> Iterator[Target]:
     yield gains("the same / SM from samples", whole, theirs, 15.0)
 
 
-def fits(of: Problem, repeats: int) -> Iterator[Target]:
-    """All trials and their driver in one fit, the driver alone, and batches of three periods."""
-    lanes, calibration = len(of.records), of.study["calibration/0"]
+def fits(ten: Problem, repeats: int) -> Iterator[Target]:
+    """A driver, a skin alone and in a batch, and a trial of a joint fit, by length of the records.
+
+    They are those of [how fast](../docs/speed.md).
+    """
+    lanes = len(ten.records)
+    three, one = problem(10_000, lanes), problem(3_334, lanes)
     batch = np.resize(np.arange(lanes), BATCH)
-    alone = median_time(lambda: peers.judged(of)(batch), repeats) / BATCH
-    found = median_time(lambda: etid.identify_jointly(of.study), repeats) / lanes
-    text = f"{1e3 * found:.2f}, alone {1e3 * alone:.2f}"
-    yield Target("joint fit of a trial [ms]", 1e3 * found, most=3.0, text=text)
-    method = "maximum_likelihood"
-    found = median_time(
-        lambda: etid.identify_driver(calibration, method=method, throw=False), repeats
-    )
-    yield Target("driver, warm [ms]", 1e3 * found, most=250.0)  # by NumPy: nothing is compiled
-    three, of_file = problem(10_000, lanes), problem(5_000, lanes, sample_rate=100e3)
-    ours = median_time(lambda: peers.judged(three)(batch), repeats) / BATCH
+    in_batch = f"skin, batch of {BATCH}"
+    for name, of in {"ten periods": ten, "three periods": three, "one period": one}.items():
+        known, run = of.study["calibration/0"], peers.judged(of)
+        calls = {
+            "driver": (lambda known=known: etid.identify_driver(known, throw=False), 1),
+            "skin": (lambda run=run: run(batch[:1]), 1),
+            in_batch: (lambda run=run: run(batch), BATCH),
+        }
+        if of is not one:  # a joint fit needs several periods
+            joint = f"trial, joint fit of {lanes}"
+            calls[joint] = (lambda of=of: etid.identify_jointly(of.study), lanes)
+        for what, (call, count) in calls.items():
+            ms = 1e3 * median_time(call, repeats) / count
+            most = MOST.get(what, MOST_OF_JOINT) if of is three else np.nan
+            yield Target(f"{what}, {name} [ms]", ms, most=most)
     by_scipy = peers.from_samples_by_scipy(three)
+    ours = median_time(lambda: peers.judged(three)(batch), repeats) / BATCH
     theirs = median_time(lambda: by_scipy(batch[:1]), repeats)
     yield gains("SciPy on harmonics / skin, 10 000 samples", ours, theirs, 12.0)
-    stored = median_time(lambda: peers.judged(of_file)(batch), repeats) / BATCH
-    yield Target("10^5 recordings of 5 000 samples [s]", 1e5 * stored, most=20.0)
+    scene = recorded({f"{at}": LOAD for at in range(lanes)}, {}, current_snr_db=60.0)
+    records = list(scene.simulate(seed=3).recordings())
+    currents = [records[at] for at in batch]
+    ms = 1e3 * median_time(lambda: etid.identify_skins(currents, None), repeats) / BATCH
+    yield Target("skin by a measured current, batch, three periods [ms]", ms)
 
 
 def tick(electrodes: int, ticks: int) -> Target:
@@ -165,8 +182,10 @@ def commands() -> Iterator[Target]:
             return float(np.median(took))
 
         yield Target("etid --help [CPU s]", cpu("--help"), most=0.4)
-        fit = cpu("fit", "study.h5", "-o", "fits.h5", "--force")
-        yield Target("etid fit of ten recordings [CPU s]", fit, most=4.0)
+        for joint in ((), ("--joint",)):
+            fit = cpu("fit", "study.h5", "-o", "fits.h5", "--force", *joint)
+            name = " ".join(("etid fit", *joint))
+            yield Target(f"{name} of ten recordings [CPU s]", fit, most=4.0)
         report_of = cpu("report", "fits.h5", "--force")
         yield Target("etid report of them [CPU s]", report_of, most=4.0)
 
@@ -174,9 +193,10 @@ def commands() -> Iterator[Target]:
 def main(arguments: argparse.Namespace) -> bool:
     quick = arguments.quick
     lanes, repeats = (8, 3) if quick else (98, 7)
-    targets = [*in_new_processes(), *commands(), *filters(5 * repeats)]
     ten_periods = problem(SAMPLES, lanes)
-    for of in (solvers, from_samples, fits):
-        targets += of(ten_periods, repeats)
-    targets.append(tick(lanes, 20 * repeats if quick else 2000))
+    targets = itertools.chain(
+        *(in_new_processes(), commands(), filters(5 * repeats)),
+        *(of(ten_periods, repeats) for of in (solvers, from_samples, fits)),
+        (tick(*of) for of in [(lanes, 20 * repeats if quick else 2000)]),
+    )
     return report(targets)

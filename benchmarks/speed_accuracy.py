@@ -4,7 +4,9 @@ An error is that of the elements over their Cramer-Rao bounds, the median over d
 calibration of their own and its 95 % interval; a time is that of one skin from its samples, the
 driver known, compilation apart, on one core. Methods with the driver of the default or of maximum
 likelihood have all draws, others as many as a budget allows. Rivals have environments of their own
-(`python -m benchmarks rivals`); one that has none is in the table with the reason.
+(`python -m benchmarks rivals`); one that has none is in the table with the reason, without draws.
+Those that fit the same residuals as etid have `OF_STRONG` draws, and a second row with the Z_th
+that etid finds: it tells their driver from their fit of the skin. All scenes take some six hours.
 """
 
 import argparse
@@ -22,9 +24,10 @@ from benchmarks import rivals
 from benchmarks.estimators import DEFAULT, ELEMENTS, NOTHING, OURS, Answer, Drivers, method_of
 from benchmarks.ladder import CALIBRATION, SOURCES, START, TRIAL, ladder
 from benchmarks.machine import make_room, read_csv, timed, write_csv
-from benchmarks.rates import LEVEL, median_interval
+from benchmarks.rates import FEWEST, LEVEL, median_interval
+from benchmarks.rivals.records import harmonics
 from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report, show
-from benchmarks.speed_accuracy_chart import chart
+from benchmarks.speed_accuracy_chart import KNOWN, chart
 from etid.simulation.scenes import Scene
 
 PINNED = True
@@ -33,7 +36,11 @@ BUDGET = 60.0  # [s] for the draws of a method with a driver of its own in one s
 TIMED = 6.0  # [s] for a timed batch that NumPy runs, and for a rival in one scene
 BATCH = 512  # recordings of a timed batch; so many are compiled
 PATIENCE = 30  # budgets that a rival may take for all it has begun
-FEWEST, OF_RIVALS = 4, 24  # draws, however long they take; at most
+OF_RIVALS, OF_STRONG = 24, 100  # draws, at most; of those on etid's residuals, however long
+MEASURED = (
+    *("error", "error_low", "error_high", *(f"error_{name}" for name in ELEMENTS)),
+    *("none", "said", "wrong", "silent"),
+)
 PRINTED = (
     *("scene", "estimator", "mode", "draws", "error", "error_low", "error_high"),
     *("none", "said", "wrong", "silent", "ms", "first_s", "driver_ms", "on_front", "missing"),
@@ -45,7 +52,7 @@ TARGETS = {
     "part of the draws in which the default is wrong silently": at_most(0),
     "error of the default, in bounds": at_most(np.nextafter(2.0, 0)),
 }
-WORSE = ("steiglitz_mcbride", "equation_error")  # their errors must be larger than the default's
+WORSE = "steiglitz_mcbride"  # its error must be larger than the default's
 
 OPTIONS = (
     QUICK,
@@ -86,7 +93,7 @@ class Result(NamedTuple):
 
     estimator: str  # its name
     mode: str  # `alone`, one recording a call; `batched`; or `rival`
-    answers: Sequence[Answer]  # one for each draw
+    answers: Sequence[Answer]  # one for each draw; none if it could not be run
     seconds: float = np.nan  # of one skin, its driver known: median, compilation apart
     first_seconds: float = np.nan  # of the first call
     driver_seconds: float = np.nan  # of one driver, median
@@ -105,7 +112,9 @@ class Result(NamedTuple):
         return np.where(np.isfinite(sizes).all(1, keepdims=True), sizes, np.inf)
 
     def row(self) -> dict[str, Any]:
-        """Medians of the errors, and parts of the draws, as a table has them."""
+        """Medians of the errors, and parts of the draws, as a table has them; NaN without draws."""
+        if not self.answers:
+            return dict.fromkeys(MEASURED, np.nan)
         answered, low, high = np.isfinite(self.each), *median_interval(self.each)
         good = np.array([of.usable for of in self.answers])
         with np.errstate(invalid="ignore"):
@@ -165,29 +174,39 @@ def ours(draws: Draws, drivers: Drivers, name: str) -> Iterator[Result]:
         yield alone._replace(mode="batched", seconds=each, first_seconds=several[0])
 
 
-def theirs(draws: Draws) -> Iterator[Result]:
-    """All rivals, each in its environment; what is missing is a result that says why."""
-    studies = draws.studies[:OF_RIVALS]
-    given = rivals.problem([(study[TRIAL], study[CALIBRATION]) for study in studies], START)
+def theirs(draws: Draws, drivers: Drivers) -> Iterator[Result]:
+    """All rivals, each in its environment; strong ones once more with the Z_th of etid."""
     for module, rival in rivals.RIVALS.items():
-        outcome, name = rivals.run(module, given, 1, PATIENCE * TIMED, TIMED), rival.name
-        if outcome.missing:
-            none = draws.answer(name, 0, "missing", NOTHING, NOTHING)
-            yield Result(name, "rival", [none], missing=outcome.missing)
-            continue
-        times = outcome.seconds[np.isfinite(outcome.seconds)]
-        yield Result(
-            name,
-            "rival",
-            [
-                draws.answer(name, i, "successful" if ok else "refused", value, NOTHING)
-                for i, (value, ok) in enumerate(zip(outcome.elements, outcome.ok, strict=True))
-            ],
-            float(np.median(times)) if times.size else np.nan,
-            outcome.first_seconds,
-            float(np.nanmedian(outcome.driver_seconds)),
-            "" if times.size else next(filter(None, outcome.errors), "no answer"),
-        )
+        studies = draws.studies[: OF_STRONG if rival.strong else OF_RIVALS]
+        given = rivals.problem([(study[TRIAL], study[CALIBRATION]) for study in studies], START)
+        limits = (None, np.inf) if rival.strong else (PATIENCE * TIMED, TIMED)
+        yield outcome(draws, rival.name, rivals.run(module, given, 1, *limits))
+        if rival.strong:
+            given["z_th"] = np.stack([z_th(study, drivers) for study in studies])
+            yield outcome(draws, rival.name + KNOWN, rivals.run(module, given, 1, *limits))
+
+
+def z_th(study: etid.Study, drivers: Drivers) -> np.ndarray:
+    """What etid finds at the harmonics of a trial [ohm]; NaN without a driver."""
+    trial, driver = study[TRIAL], drivers.of([study[CALIBRATION]], DEFAULT)
+    f = harmonics(trial.v_th, trial.v_out, trial.sample_rate, trial.pulse_rate).f
+    return np.full(f.size, np.nan) if driver is None else np.asarray(driver.response(f))
+
+
+def outcome(draws: Draws, name: str, of: rivals.Outcome) -> Result:
+    """What a rival made of the first draws; what could not be run says why."""
+    if of.missing:
+        return Result(name, "rival", (), missing=of.missing)
+    answers = [
+        draws.answer(name, i, "successful" if ok else "refused", value, NOTHING)
+        for i, (value, ok) in enumerate(zip(of.elements, of.ok, strict=True))
+    ]
+    seconds, of_driver = (
+        float(np.median(times)) if (times := every[np.isfinite(every)]).size else np.nan
+        for every in (of.seconds, of.driver_seconds)
+    )
+    why = "" if np.isfinite(seconds) else next(filter(None, of.errors), "no answer")
+    return Result(name, "rival", answers, seconds, of.first_seconds, of_driver, why)
 
 
 def rows_of(name: str, source: str, repetitions: int, quick: bool) -> list[dict[str, Any]]:
@@ -197,7 +216,7 @@ def rows_of(name: str, source: str, repetitions: int, quick: bool) -> list[dict[
     results = [
         result for of in OURS for result in itertools.islice(ours(draws, drivers, of), modes)
     ]
-    results += [] if quick else theirs(draws)
+    results += [] if quick else theirs(draws, drivers)
     scored = [result.row() for result in results]
     on_front = front([of.seconds for of in results], [of["error"] for of in scored])
     beaten_by = "; ".join(dominators(results))
@@ -242,9 +261,9 @@ def dominators(results: Sequence[Result]) -> list[str]:
     own, found = mine[-1], []
     for of in results:
         size = min(len(of.answers), len(own.answers))
-        a, b = of.each[:size], own.each[:size]
-        if not of.seconds < own.seconds or not np.isfinite(a).all():
+        if not of.seconds < own.seconds or not np.isfinite(of.each).all():
             continue
+        a, b = of.each[:size], own.each[:size]
         gain = np.log(b) - np.log(a)
         far = scipy.stats.t.isf((1 - LEVEL) / 2, size - 1) * np.std(gain, ddof=1) / np.sqrt(size)
         if np.mean(gain) > far:  # of two draws it has to be far
@@ -263,9 +282,8 @@ def ranked(rows: Sequence[dict[str, Any]]) -> Iterator[Target]:
             for (name, limits), value in zip(TARGETS.items(), values, strict=True)
         ]
         found[0] = found[0]._replace(text=default["beaten_by"])
-        for worse in WORSE:
-            least, error = np.nextafter(default["error"], np.inf), of[worse]["error"]
-            found.append(Target(f"{scene}: error of {worse}", error, least))
+        least, error = np.nextafter(default["error"], np.inf), of[WORSE]["error"]
+        found.append(Target(f"{scene}: error of {WORSE}", error, least))
         yield from (target for target in found if not target.met)
 
 

@@ -18,7 +18,6 @@ LETTERS = {
     "maximum_likelihood": "max. likelihood",
     "output_error": "output error",
     "steiglitz_mcbride": "Steiglitz-McBride",
-    "equation_error": "equation error",
     "SciPy least_squares, harmonics": "SciPy",
     "SciPy least_squares, lfilter": "lfilter",
     "lmfit leastsq": "lmfit",
@@ -31,6 +30,7 @@ LETTERS = {
     "Octave arx": "arx",
     "Octave n4sid": "n4sid",
 }
+KNOWN = ", Z_th of etid"  # a rival with the driver of etid has a star
 COLUMNS = 3
 WORST = 1e3  # bounds; what is further off stands here, with an arrow
 OFTEN = 0.5  # part of the draws in which an estimator disowns its answer, or has none
@@ -38,7 +38,8 @@ OFTEN = 0.5  # part of the draws in which an estimator disowns its answer, or ha
 
 def short(name: str) -> str:
     """What stands in a panel for an estimator."""
-    return LETTERS.get(name, name)
+    own = name.removesuffix(KNOWN)
+    return LETTERS.get(own, own) + "*" * (own != name)
 
 
 def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
@@ -50,21 +51,25 @@ def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     )
     for panel, name in zip(axes.flat, names, strict=False):
         absent = _panel(panel, [row for row in rows if row["scene"] == name])
-        note = f" (no answer: {', '.join(absent)})" if absent else ""
-        panel.set_title("\n".join(textwrap.wrap(name + note, 58)), fontsize=9)
+        notes = "; ".join(f"{why}: {', '.join(of)}" for why, of in absent.items())
+        title = f"{name} ({notes})" if notes else name
+        panel.set_title("\n".join(textwrap.wrap(title, 58)), fontsize=9)
     for panel in axes.flat[len(names) :]:
         panel.set_visible(False)
     for panel in axes[:, 0]:
         panel.set_ylabel("median error / Cramer-Rao bound")
     for panel in axes[-1]:
         panel.set_xlabel("time per skin [ms]")
-    ours = [int(row["draws"]) for row in rows if row["mode"] != "rival"]
-    theirs = [int(row["draws"]) for row in rows if row["mode"] == "rival"] or ours
+    drawn = [row for row in rows if row["draws"]]
+    ours = [int(row["draws"]) for row in drawn if row["mode"] != "rival"]
+    theirs = [int(row["draws"]) for row in drawn if row["mode"] == "rival"] or ours
     figure.supxlabel(
         "\n".join(
             textwrap.wrap(
-                "Filled: etid, its default method in bold; open: rivals. Upright lines are 95 % "
-                "intervals of the medians, level ones lead from one recording a call to a batch. "
+                "Filled: etid, its default method in bold; open: rivals, with a star if they know "
+                "the Z_th that etid finds. Upright lines are 95 % intervals of the medians, which "
+                "fewer than six draws do not give; level ones lead from one recording a call to a "
+                "batch. "
                 "(In brackets): says itself that most of its answers are not good. Dashed: what "
                 "nothing beats in both. Grey: where an efficient estimator is. "
                 f"{min(ours)} to {max(ours)} draws of each of etid's methods, {min(theirs)} to "
@@ -77,11 +82,11 @@ def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     charts.save(figure, path)
 
 
-def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Draw one scene; the estimators that have no answer there."""
+def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Draw one scene; the estimators that are not drawn, by the reason."""
     axes.set(xscale="log", yscale="log")
     axes.axhline(0.89, color="0.7", linewidth=3, zorder=0)
-    texts, marks, absent = [], [], []
+    texts, marks, absent = [], [], dict[str, list[str]]()
     same = {row["error"] for row in rows if row["estimator"] == "default"}
     for name in dict.fromkeys(row["estimator"] for row in rows):
         if (
@@ -93,7 +98,7 @@ def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> list[str]:
         of = {row["mode"]: row for row in rows if row["estimator"] == name}
         best = of.get("batched") or next(iter(of.values()))
         if not np.isfinite(best["error"]):
-            absent.append(short(name))
+            absent.setdefault("no answer" if best["draws"] else "not run", []).append(short(name))
             continue
         error = min(best["error"], WORST)
         theirs = best["mode"] == "rival"
@@ -102,7 +107,8 @@ def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> list[str]:
                 [of["alone"]["ms"], best["ms"]], [error, error], color=charts.INK, linewidth=0.8
             )
         scatter = np.clip([best["error_low"], best["error_high"]], None, WORST)
-        marks += axes.plot([best["ms"]] * 2, scatter, color=charts.INK, linewidth=0.8)
+        if not np.isnan(scatter).any():
+            marks += axes.plot([best["ms"]] * 2, scatter, color=charts.INK, linewidth=0.8)
         marks += axes.plot(
             best["ms"],
             error,

@@ -12,6 +12,7 @@ import pathlib
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -76,12 +77,46 @@ OPTIONS = (
 )
 
 
+def mapping_of(source: pathlib.Path) -> dict[str, Any]:
+    """The mapping of a SPICE recording, whose archive has codes, resistors, rates and a scale.
+
+    It has no unloaded records for the calibrations: they share the first.
+    """
+    with np.load(source) as archive:
+        resistors = archive["R_ref"]
+        rate, pulses, step, scale = (float(archive[name]) for name in ("fs", "f0", "lsb", "scale"))
+        codes = np.iinfo(archive["adc_th"].dtype)
+
+    def signal(name: str, **rows: int) -> dict[str, Any]:
+        return {"channel": name, "unit": "V", **rows}
+
+    paths = [f"calibration/{number}" for number in range(len(resistors))]
+    calibrations = [
+        {
+            "path": path,
+            "r_load": float(resistors[number]),
+            "v_th": signal("adc_th", rows=0),
+            "v_out": signal("adc_ref", rows=number),
+        }
+        for number, path in enumerate(paths)
+    ]
+    trials = {"v_th": signal("adc_th"), "v_out": signal("adc_out")}
+    return {
+        "sample_rate": rate,
+        "pulse_rate": pulses,
+        "scale": scale / step,  # codes per volt at the terminal
+        "adc_range": (codes.min * step / scale, codes.max * step / scale),
+        "condition": source.stem,
+        "recording": [*calibrations, {"path": "loaded", "calibration": paths, **trials}],
+    }
+
+
 @contextlib.contextmanager
 def imported(source: pathlib.Path) -> Iterator[etid.Study]:
     """A SPICE recording as a study."""
     with tempfile.TemporaryDirectory() as folder:
         file = pathlib.Path(folder, "study.h5")
-        etid.import_file(source, file)
+        etid.import_file(source, file, mapping_of(source))
         with etid.read(file) as study:
             yield study
 

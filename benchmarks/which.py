@@ -34,7 +34,7 @@ def read(path: pathlib.Path) -> list[dict[str, Any]]:
 def table(rows: Sequence[Row]) -> str:
     """Markdown: a row for each scene with the error of each estimator, and which to use.
 
-    Behind an error is the 95 % interval of the median.
+    Behind an error is the 95 % interval of the median, if there are draws enough for one.
     """
     of_method = {name: [row for row in rows if row["estimator"] == name] for name in names()}
     methods = [name for name, of in of_method.items() if of]
@@ -68,7 +68,8 @@ def best(rows: Sequence[Row]) -> str | None:
         if row["estimator"] in names() and row["silent"] == 0 and np.isfinite(row["error"])
         if _is_trusted(row)
     ]
-    limit = min((row["error_high"] for row in trusted), default=np.nan)
+    highs = [row["error_high"] for row in trusted if np.isfinite(row["error_high"])]
+    limit = min(highs, default=np.nan)
     good = [row for row in trusted if row["error_low"] <= limit and row["draws"] >= ENOUGH]
     if not good:
         return None
@@ -84,7 +85,8 @@ def _cell(row: Row | None, used: bool) -> str:
     if row is None or not np.isfinite(row["error"]):
         return "-"
     text, low, high = (_short(row[name]) for name in ("error", "error_low", "error_high"))
-    text = f"{text} ({low} to {high})" if _is_trusted(row) else f"[{text}]"
+    scatter = f" ({low} to {high})" if np.isfinite(row["error_low"]) else ""
+    text = f"{text}{scatter}" if _is_trusted(row) else f"[{text}]"
     text += " silent" if row["silent"] > 0 else ""
     return f"**{text}**" if used else text
 

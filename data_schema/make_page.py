@@ -137,9 +137,7 @@ A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Key
   pulses, the name of a trigger channel at the rising edges of the trigger. A trial then has the
   pulses from one edge to the next, up to the first pause.
 - `electrode`: as below; and where the electrodes of an array fire in turn within one long record,
-  a list of their names in this order (with `split` by pauses or by a trigger), or a name with the
-  channel of the number in braces, as in `split = "which"` and `electrode = "E{which}"`: a part has
-  the pulses while the value of `which` is the same. Each electrode then becomes the recordings
+  a list of their names in this order, with `split`. Each electrode then becomes the recordings
   `path/E7/0`, `path/E7/1`, ….
 - `path` of the recording in the etid file. Several trials become `path/0`, `path/1`, …. Without a
   path, a single `[[recording]]` becomes `loaded/0`, …, or with `r_load` `calibration/0`, ….
@@ -240,9 +238,23 @@ v_out = {channel = "channel 0", rows = [1, 2]}
 
 ### NumPy
 
-A `.npz` archive with these arrays needs no mapping: the converter codes `adc_th` and `adc_out`
-(trial, time) and `adc_ref` (resistor, time), and the numbers `R_ref`, `fs`, `f0`, `lsb` and
-`scale`. All calibrations then share the first row of `adc_th`.
+```toml
+# Converter codes (trial, time): 100 of them are 1 V at the terminal.
+sample_rate = 200e3
+pulse_rate = 60.0
+scale = 100.0
+v_th = {channel = "open", unit = "V"}
+
+[[recording]]
+path = "calibration/98k8"
+r_load = 98.8e3
+v_out = {channel = "resistor", unit = "V"}
+
+[[recording]]
+path = "loaded"
+calibration = "calibration/98k8"
+v_out = {channel = "skin", unit = "V"}
+```
 """
 
 

@@ -26,11 +26,9 @@ from .estimators.maximum_likelihood.estimator import MaximumLikelihood as Maximu
 from .estimators.output_error import OutputError as OutputError
 from .estimators.registry import register as register
 from .estimators.steiglitz_mcbride.arrays import steiglitz_mcbride as steiglitz_mcbride
-from .estimators.steiglitz_mcbride.estimator import EquationError as EquationError
 from .estimators.steiglitz_mcbride.estimator import SteiglitzMcBride as SteiglitzMcBride
 from .files.exporting import export_circuit as export_circuit
 from .files.exporting import export_fits as export_fits
-from .files.exporting import export_study as export_study
 from .files.folder import import_folder as import_folder
 from .files.importing import import_file as import_file
 from .files.spectra import read_impedance as read_impedance
@@ -52,8 +50,6 @@ from .identify.skins import identify_skins as identify_skins
 from .identify.skins import select_circuit as select_circuit
 from .identify.study import identify_study as identify_study
 from .nonlinear.identify import identify_amplitudes as identify_amplitudes
-from .online.controller import Controller as Controller
-from .online.tracker import Tracker as Tracker
 from .plotting import plot as plot
 from .plotting.layout import Layout as Layout
 from .plotting.layout import read_layout as read_layout

@@ -1,11 +1,13 @@
 """The program `etid`, which is also `python -m etid`."""
 
+import argparse
 import atexit
 import gc
 import io
 import os
 import signal
 import sys
+from collections.abc import Callable
 from types import FrameType
 from typing import NoReturn
 
@@ -13,8 +15,27 @@ from typing import NoReturn
 def main() -> int:
     """Run the command of this process; see `etid.cli`.
 
+    Returns:
+        Exit status.
+    """
+
+    def parser() -> argparse.ArgumentParser:
+        from etid.cli import parser_for  # `from etid import cli` would import all layers
+
+        return parser_for(sys.argv[1:])
+
+    return started("etid", parser)
+
+
+def started(program: str, parser: Callable[[], argparse.ArgumentParser]) -> int:
+    """Run a program of etid with the arguments of this process.
+
     The imports take a second. A KeyboardInterrupt during them may be lost, because JAX is called
     by the garbage collector, which ignores exceptions. Nothing has begun yet, so the process ends.
+
+    Args:
+        program: Its name.
+        parser: Makes its parser, after all imports that it needs.
 
     Returns:
         Exit status.
@@ -24,16 +45,22 @@ def main() -> int:
     atexit.register(gc.freeze)
     usual = signal.getsignal(signal.SIGINT)
     if usual is signal.default_int_handler:  # a program in the background ignores the signal
-        signal.signal(signal.SIGINT, _end)
-    _open_streams()
-    from etid.cli import parser_for, run  # `from etid import cli` would import all layers
 
-    commands = parser_for(sys.argv[1:])
+        def end(number: int, frame: FrameType | None) -> NoReturn:
+            del number, frame
+            os.write(2, f"{program}: interrupted: nothing was changed\n".encode())
+            os._exit(_INTERRUPTED)
+
+        signal.signal(signal.SIGINT, end)
+    _open_streams()
+    commands = parser()
+    from etid.cli import run
+
     try:
         signal.signal(signal.SIGINT, usual)
         return run(commands, sys.argv[1:])
     except KeyboardInterrupt:  # before or after the command itself
-        print("etid: interrupted", file=sys.stderr)
+        print(f"{program}: interrupted", file=sys.stderr)
         return _INTERRUPTED
 
 
@@ -44,13 +71,6 @@ def _open_streams() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-
-
-def _end(number: int, frame: FrameType | None) -> NoReturn:
-    """End the process with one line."""
-    del number, frame
-    os.write(2, b"etid: interrupted: nothing was changed\n")
-    os._exit(_INTERRUPTED)
 
 
 _INTERRUPTED = 128 + signal.SIGINT  # as shells report it

@@ -39,12 +39,11 @@ COMMANDS = {
     "check": ("check", "list the faults of a file of recordings, field by field"),
     "fit": ("fit", "identify the drivers and the loads of a file of recordings"),
     "report": ("report", "write a report about a file of fits: one HTML page"),
-    "export": ("exporting", "convert fits or recordings into files for other programs"),
+    "export": ("exporting", "convert fits into files for other programs"),
     "merge": (
         "merging",
         "write the recordings of several files into one file, each in a group of its own",
     ),
-    "live": ("live", "show and control a running display in the browser"),
     "simulate": ("simulate", "simulate recordings of an experiment"),
 }
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")  # the shells that shtab supports
@@ -96,17 +95,17 @@ def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
             outcome = arguments.module.run(arguments)
     except (RecordingError, IdentificationError, ValueError, OSError) as error:
         text = in_one_line(error)
-        print(f"etid: error: {text}", file=sys.stderr)
+        print(f"{commands.prog}: error: {text}", file=sys.stderr)
         outcome = Outcome(data={"error": text}, status=WRONG_DATA)
     except KeyboardInterrupt as error:
         text = in_one_line(error) or _after_interrupt(arguments)
-        print(f"etid: interrupted: {text}", file=sys.stderr)
+        print(f"{commands.prog}: interrupted: {text}", file=sys.stderr)
         return INTERRUPTED
     text = outcome.text
     if arguments.json:
         data = {"command": arguments.command, "status": outcome.status, **outcome.data}
         text = json.dumps(_plain(data), ensure_ascii=False, allow_nan=False)
-    return max(outcome.status, _print(text))
+    return max(outcome.status, _print(text, commands.prog))
 
 
 def _files(arguments: argparse.Namespace) -> list[pathlib.Path]:
@@ -202,9 +201,21 @@ def parser(wanted: Iterable[str] = COMMANDS) -> argparse.ArgumentParser:
     Args:
         wanted: Commands whose arguments it knows; of the others it knows the names only.
     """
+    parser = program("etid", "Identify circuits from electro-tactile stimulation recordings.")
+    parser.epilog = f"{parser.epilog} The program etid-live shows a running display."
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    for name, (module_name, summary) in COMMANDS.items():
+        command = commands.add_parser(name, help=summary)
+        if name in wanted:
+            add_command(command, f"etid.commands.{module_name}")
+    return parser
+
+
+def program(name: str, description: str = "") -> argparse.ArgumentParser:
+    """Parser of a program, with the options that all have."""
     parser = argparse.ArgumentParser(
-        prog="etid",
-        description="Identify circuits from electro-tactile stimulation recordings.",
+        prog=name,
+        description=description,
         epilog="Exit status: 0 done, 1 faulty data, 2 wrong usage, 130 interrupted.",
     )
     parser.add_argument(
@@ -217,30 +228,22 @@ def parser(wanted: Iterable[str] = COMMANDS) -> argparse.ArgumentParser:
         choices=SHELLS,
         help="print the completion script of this shell (etid[completion])",
     )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    for name, (module_name, summary) in COMMANDS.items():
-        if name not in wanted:
-            commands.add_parser(name, help=summary)
-            continue
-        module = _module(module_name)
-        command = commands.add_parser(name, help=summary, description=module.__doc__)
-        module.add_arguments(command)
-        if hasattr(module, "outputs"):
-            command.add_argument("--force", action="store_true", help="replace existing files")
-        command.add_argument(
-            "--json", action="store_true", help="print one JSON object instead of text"
-        )
-        command.set_defaults(module=module)
     return parser
 
 
-def _module(name: str) -> Any:
-    """The module of a command, in a process that is set up for it."""
+def add_command(parser: argparse.ArgumentParser, name: str) -> None:
+    """Give a parser the arguments of a module of a command, and set up the process for it."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     _keep_programs(jax.config)
-    return importlib.import_module(f"etid.commands.{name}")
+    module = importlib.import_module(name)
+    parser.description = module.__doc__
+    module.add_arguments(parser)
+    if hasattr(module, "outputs"):
+        parser.add_argument("--force", action="store_true", help="replace existing files")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    parser.set_defaults(module=module)
 
 
 class _Version(argparse.Action):
@@ -252,7 +255,8 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         of = importlib.metadata.version  # it searches folders, so not at every start
         versions = f"etid {etid.__version__}, JAX {of('jax')}, NumPy {np.__version__}"
-        parser.exit(_print(f"{versions}, Python {platform.python_version()}, {platform.machine()}"))
+        versions = f"{versions}, Python {platform.python_version()}, {platform.machine()}"
+        parser.exit(_print(versions, parser.prog))
 
 
 class _Completion(argparse.Action):
@@ -266,7 +270,7 @@ class _Completion(argparse.Action):
 
             parser.error(f"--completion needs shtab: {install('completion')}")
         _complete_paths(parser, shtab.FILE)
-        parser.exit(_print(shtab.complete(parser, shell)))
+        parser.exit(_print(shtab.complete(parser, shell), parser.prog))
 
 
 def _complete_paths(parser: argparse.ArgumentParser, how: Any) -> None:
@@ -279,8 +283,12 @@ def _complete_paths(parser: argparse.ArgumentParser, how: Any) -> None:
                 _complete_paths(command, how)
 
 
-def _print(text: str) -> int:
+def _print(text: str, program: str) -> int:
     """Print a text unless it is empty; a closed pipe, as after `| head`, is no error.
+
+    Args:
+        text: The text.
+        program: Name of the program, for the message that it cannot be written.
 
     Returns:
         Exit status.
@@ -293,7 +301,7 @@ def _print(text: str) -> int:
             os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
         )  # Python flushes stdout at exit
         if not isinstance(error, BrokenPipeError):
-            print(f"etid: error: the output cannot be written ({error})", file=sys.stderr)
+            print(f"{program}: error: the output cannot be written ({error})", file=sys.stderr)
             return WRONG_DATA
     return DONE
 

@@ -3,10 +3,11 @@
 import numpy as np
 
 import etid
+import etid.display
 
 long = etid.scenes.paper_dry(snr_db=60.0, samples=40_000).simulate(seed=0)
 driver = etid.identify_driver(long["calibration/98k8"])
-tracker = etid.Tracker.of(driver, long["calibration/98k8"], electrodes=10)
+tracker = etid.display.Tracker.of(driver, long["calibration/98k8"], electrodes=10)
 pulses = tracker.pulses(np.stack([one.v_out for one in long.loaded.recordings()]))
 state = tracker.start()
 for number, v_out in enumerate(pulses, 1):

@@ -4,10 +4,10 @@
     python examples/stream_display.py calibration.h5 pulses.h5
     python examples/stream_display.py calibration.h5 pulses.h5 --page
 
-`etid live` follows a file, or a stimulator at a socket. A lab with another source or stimulator, or
-with a log, adapts these lines: `played` becomes its source of blocks (see `etid.online.stream`),
-and a `Stimulator` gets what sends amplitudes (see `etid.live.stimulator`). `--page` opens the live
-view.
+`etid-live` follows a file, or a stimulator at a socket. A lab with another source or stimulator, or
+with a log, adapts these lines: `played` becomes its source of blocks (see `etid.display.stream`),
+and a `Stimulator` gets what sends amplitudes (see `etid.display.stimulator`). `--page` opens the
+live view.
 
 * The calibration file is an etid study whose calibrations have several periods.
 * The pulses are the dataset `v_out` (electrode, sample) [V] of an HDF5 file, played in real time.
@@ -26,10 +26,11 @@ import h5py
 import numpy as np
 
 import etid
-from etid.live.loop import follow
-from etid.live.view import LiveView
-from etid.online.state import Change
-from etid.online.stream import played
+import etid.display
+from etid.display.loop import follow
+from etid.display.state import Change
+from etid.display.stream import played
+from etid.display.view import LiveView
 
 FLUSHED = 15  # pulses from one flush of the log to the next
 
@@ -80,8 +81,8 @@ def run(arguments: argparse.Namespace) -> None:
     with etid.read(arguments.calibration) as study:
         calibrations = list(study.calibrations.recordings())
     driver, electrodes = etid.identify_driver(calibrations), arguments.electrodes
-    tracker = etid.Tracker.of(driver, calibrations[0], electrodes=electrodes, change=3e-3)
-    controller = etid.Controller.of(tracker)
+    tracker = etid.display.Tracker.of(driver, calibrations[0], electrodes=electrodes, change=3e-3)
+    controller = etid.display.Controller.of(tracker)
     blocks = played(arguments.pulses, electrodes, calibrations[0].sample_rate, arguments.speed)
     charge, names = arguments.charge, tracker.model.circuit.names()
     view = tick = None

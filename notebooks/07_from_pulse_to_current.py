@@ -27,6 +27,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import etid
+import etid.display
 from etid.simulation.transformer import (
     ResistorLoad,
     Sampler,
@@ -54,7 +55,7 @@ trials = [Trial(name, skin) for name, skin in SKINS.items()]
 study = Scene(tuple(trials), tuple(resistors), samples=40_000).simulate(SEED)
 calibrations = list(study.calibrations.recordings())
 driver = etid.identify_driver(calibrations)
-tracker = etid.Tracker.of(driver, calibrations[0], electrodes=2, change=3e-3)
+tracker = etid.display.Tracker.of(driver, calibrations[0], electrodes=2, change=3e-3)
 
 # %% [markdown]
 # ## Limits
@@ -62,7 +63,7 @@ tracker = etid.Tracker.of(driver, calibrations[0], electrodes=2, change=3e-3)
 # whatever the skin does between two pulses. Amplitudes are relative to that of the calibration.
 
 # %%
-controller = etid.Controller.of(tracker, current_cap=5e-3, fallback=0.3, probability=0.999)
+controller = etid.display.Controller.of(tracker, current_cap=5e-3, fallback=0.3, probability=0.999)
 print(controller)
 
 # %% [markdown]

@@ -41,10 +41,10 @@ RATE, SCALE = 50e3, 0.0535  # samples per second, volts at the oscilloscope per 
 # ## The files
 # The next cell invents the week: for your own recordings, leave it out. It writes what an
 # oscilloscope writes: a file for each subject, finger and day, and each morning one with a known
-# resistor. `CH1` is the unloaded output, `CH2` the output on the skin, and `CH3` the number of the
-# electrode that fires, for three pulses each. R_p grows towards the root of the finger; subjects,
-# days, fingers and electrodes have factors of their own. Electrode 15 has no contact. The display
-# is that of the paper, with 98 electrodes.
+# resistor. `CH1` is the unloaded output, `CH2` the output on the skin, and `CH3` a trigger that
+# rises when the next electrode begins to fire, for three pulses each. R_p grows towards the root of
+# the finger; subjects, days, fingers and electrodes have factors of their own. Electrode 15 has no
+# contact. The display is that of the paper, with 98 electrodes.
 
 # %%
 BETWEEN = {"subject": 0.25, "session": 0.10, "site": 0.05, "electrode": 0.03}  # of ln R_p
@@ -60,7 +60,8 @@ def recorded(loads, periods, rng):
     study = scene.simulate(int(rng.integers(2**31)))
     both = [(study[f"{number}"].v_th, study[f"{number}"].v_out) for number in loads]
     v_th, v_out = SCALE * np.concatenate(both, axis=1)
-    return np.column_stack([np.arange(v_th.size), v_th, v_out, np.repeat([*loads], size)])
+    trigger = np.tile(np.arange(size) == 10, len(loads))
+    return np.column_stack([np.arange(v_th.size), v_th, v_out, trigger])
 
 
 def write(path, table):
@@ -89,7 +90,7 @@ for day in DAYS:
                 true[subject, site, day, PLACES.electrodes[row]] = r_p
                 loads[row + 1] = SkinLoad(r_s=33.4e3, r_p=r_p, c_p=22.3e-6 / r_p)
             table = recorded(loads, 3.1, rng)
-            off = table[:, 3] == 15
+            off = np.array_split(np.arange(len(table)), 98)[14]  # of electrode 15
             table[off, 2] = table[off, 1]  # no contact: the output is the unloaded one
             write(folder / f"{subject}_{site}_{day}.csv", table)
 print(len(list(folder.iterdir())), "files, such as", min(folder.iterdir()).name)
@@ -112,16 +113,16 @@ for day in ("d1", "d2"):
 print(drivers["d2"])
 
 # %% [markdown]
-# While a display runs, `etid live driver_d1.h5 --socket localhost:5555` shows these maps in the
+# While a display runs, `etid-live driver_d1.h5 --socket localhost:5555` shows these maps in the
 # browser, and a button stops it.
 #
 # ## From the folder to one file
-# The names of the files hold the labels, and `CH3` the electrode. The calibration of a day belongs
-# to the recordings of that day. On the command line:
+# The names of the files hold the labels, and the electrodes fire in their order. The calibration of
+# a day belongs to the recordings of that day. On the command line:
 #
 #     etid import week -o week.h5 --labels '{session}_{r_load}.csv' \
 #         --labels '{subject}_{site}_{session}.csv' --v-th CH1 --v-out CH2 \
-#         --split CH3 --electrode 'E{CH3}' --scale 0.0535 --pulse-rate 60
+#         --split CH3 --electrode E{1..98} --scale 0.0535 --pulse-rate 60
 
 # %%
 study_file, fits_file = folder.parent / "week.h5", folder.parent / "fits.h5"
@@ -130,7 +131,7 @@ found = etid.import_folder(
     study_file,
     ["{session}_{r_load}.csv", "{subject}_{site}_{session}.csv"],
     split="CH3",
-    electrode="E{CH3}",
+    electrode=[*PLACES.electrodes],
     **channels,
 )
 print("\n".join(str(found).splitlines()[:4]))

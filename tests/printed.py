@@ -22,6 +22,7 @@ import pytest
 
 import etid
 from etid import cli
+from etid.display.__main__ import parser as parser_of_display
 
 OUTPUTS = pathlib.Path(__file__).parent / "outputs"
 WIDTH = 100  # columns of the terminal
@@ -84,19 +85,25 @@ def _near(before: str, now: str, error: str | None) -> bool:
     return abs(was - new) <= max(allowed, digit * 1.001)  # a last digit may be rounded elsewhere
 
 
-def transcript(*commands: str) -> str:
-    """Commands of etid, and what a terminal shows: stdout, stderr, a status that is not 0."""
-    return "\n".join(_shown(command) for command in commands)
+PROGRAMS = {
+    "etid": cli.main,
+    "etid-live": lambda words: cli.run(parser_of_display(), words),
+}
 
 
-def _shown(command: str) -> str:
+def transcript(*commands: str, program: str = "etid") -> str:
+    """Commands of a program, and what a terminal shows: stdout, stderr, a status that is not 0."""
+    return "\n".join(_shown(program, command) for command in commands)
+
+
+def _shown(program: str, command: str) -> str:
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            status = cli.main(shlex.split(command))
+            status = PROGRAMS[program](shlex.split(command))
         except SystemExit as stop:
             status = stop.code
-    shown = f"$ etid {command}\n{out.getvalue()}{err.getvalue()}"
+    shown = f"$ {program} {command}\n{out.getvalue()}{err.getvalue()}"
     return f"{shown}(exit status {status})\n" if status else shown
 
 

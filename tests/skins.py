@@ -26,3 +26,14 @@ def off(fit, truth: Any = DRY):
     truth = dataclasses.astuple(truth) if hasattr(truth, "__dataclass_fields__") else truth
     error = np.asarray(fit.circuit.values()) - np.asarray(truth)
     return error / np.asarray(fit.stderr.values())
+
+
+def sampled(coefficients, first=0, samples=10_000):
+    """Waves at 200 kHz of these Fourier coefficients of 60 Hz and its multiples (wave, harmonic).
+
+    The transform of three periods, which are 10 000 samples, is exact between them too.
+    """
+    spectra = np.zeros((len(coefficients), 5_001), complex)
+    spectra[:, 3 : 3 * np.shape(coefficients)[-1] + 1 : 3] = coefficients
+    wave = np.fft.irfft(spectra, 10_000, norm="forward")
+    return wave[:, (first + np.arange(samples)) % 10_000]

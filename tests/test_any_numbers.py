@@ -68,7 +68,6 @@ def assert_equal(written, read):
 METHODS = {
     "maximum_likelihood": ("maximum_likelihood", 80),
     "steiglitz_mcbride": ("steiglitz_mcbride", 100),
-    "equation_error": ("steiglitz_mcbride", 300),
     "output_error": ("output_error", 10),
 }
 

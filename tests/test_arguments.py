@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 import etid
+import etid.display
 from benchmarks.specimens import study_fits
 from etid.identify import arguments
 
 # The tests' own type checker would come first; a process of its own has none.
 CALLS = """
 import jax; jax.config.update("jax_enable_x64", True)
-import numpy as np, etid
+import numpy as np, etid.display
 from benchmarks.specimens import study_fits
 v = np.ones(1000)
 rec = etid.Recording(v, v, sample_rate=2e5, pulse_rate=60.0)
@@ -73,12 +74,12 @@ calls = {
     "etid.identify_impedances([(v, v)])": "spectra",
     "etid.identify_driver([cal, cal])": "calibrations[1]",
     "etid.identify_amplitudes([of_current, of_current])": "recordings[1]",
-    "etid.Tracker.of(None, cal, electrodes=2)": "driver",
-    "etid.Tracker.of(d, v, electrodes=2)": "unloaded",
-    "etid.Tracker.of(d, of_current, electrodes=2)": "v_th",
-    "etid.Tracker.of(d, cal, electrodes='98')": "electrodes",
-    "etid.Tracker.of(d, cal, electrodes=2, change='slow')": "change",
-    "etid.Controller.of(d)": "tracker",
+    "etid.display.Tracker.of(None, cal, electrodes=2)": "driver",
+    "etid.display.Tracker.of(d, v, electrodes=2)": "unloaded",
+    "etid.display.Tracker.of(d, of_current, electrodes=2)": "v_th",
+    "etid.display.Tracker.of(d, cal, electrodes='98')": "electrodes",
+    "etid.display.Tracker.of(d, cal, electrodes=2, change='slow')": "change",
+    "etid.display.Controller.of(d)": "tracker",
     "study.where(subject=1.5)": "subject",
     "study[0]": "path",
     "fits.fits.where(subjct='s01')": "subjct",

@@ -3,9 +3,9 @@
 import dataclasses
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
+import scipy.stats
 
 import etid
 from benchmarks import instruments, perturbations, speed_accuracy, which
@@ -24,7 +24,7 @@ from benchmarks.perturbation_list import (
     pair,
 )
 from benchmarks.perturbed_study import both, undisturbed
-from benchmarks.rates import COVERED, clopper_pearson, rate
+from benchmarks.rates import COVERED, LEVEL, clopper_pearson, median_interval, rate
 from benchmarks.runner import Target, report
 from etid.simulation import scenes
 from etid.simulation.scenes import Scene, Trial
@@ -138,6 +138,34 @@ def test_a_target_whose_scatter_touches_its_limits_is_missed_all_the_same(value,
     assert report([target]) == target.met
 
 
+@pytest.mark.parametrize(("draws", "ends"), [(5, None), (6, (0, 5)), (100, (39, 60))])
+def test_a_median_has_an_interval_only_if_it_is_one(draws, ends):
+    found = median_interval(np.arange(float(draws))[::-1])
+    assert np.isnan(found).all() if ends is None else found == ends
+    if ends is not None:  # so many of the draws are below the median of the population
+        below = scipy.stats.binom(draws, 0.5)
+        assert below.cdf(ends[1]) - below.cdf(ends[0]) >= LEVEL
+
+
+def test_a_rival_that_was_not_run_is_not_one_without_an_answer(tmp_path):
+    absent = speed_accuracy.Result("FFT, impedance.py", "rival", (), missing="not installed")
+    failed = Answer("Octave arx", 0, "skin/01", "refused", NOTHING, NOTHING, NOTHING)
+    rows = [
+        {"scene": "dry", "estimator": of.estimator, "mode": of.mode, "draws": len(of.answers)}
+        | {**of.row(), "ms": np.nan, "on_front": False}
+        for of in (
+            absent,
+            speed_accuracy.Result("Octave arx", "rival", (failed,)),
+            speed_accuracy.Result("default", "alone", (failed,)),
+        )
+    ]
+    assert np.isnan([rows[0]["error"], rows[0]["none"]]).all()
+    assert (rows[1]["error"], rows[1]["none"]) == (np.inf, 1.0)
+    speed_accuracy.chart(rows, tmp_path / "chart.svg")
+    text = (tmp_path / "chart.svg").read_text()
+    assert "dry (not run: impedance.py; no answer: arx, etid)" in " ".join(text.split())
+
+
 def test_the_readme_has_the_table_of_the_last_results():
     made, page = which.table(which.read(RESULTS / speed_accuracy.FILE)), which.README.read_text()
     assert which.inserted(page, made) == page, "run python -m benchmarks which"
@@ -193,14 +221,16 @@ def test_large_files_follow_the_schema_in_all_layouts_and_are_made_once(tmp_path
         assert etid.check(path) == []
         with etid.read(path) as of:
             assert (len(of.loaded), len(of.calibrations)) == (FEW_RECORDINGS, 1)
-            assert of["s0000/skin/0"].v_out.size == SAMPLES
+            rows = [
+                of[f"s0000/skin/{row}"].samples["v_out"].stored for row in range(FEW_RECORDINGS)
+            ]
+            assert rows[0].size == SAMPLES
+            stacks.append(np.stack(rows))
         before = path.stat().st_mtime_ns
         assert large_file(tmp_path, FEW_RECORDINGS, layout).stat().st_mtime_ns == before
-        with h5py.File(path) as file:
-            stacks.append(np.asarray(file["s0000/skin/v_out"]))
     np.testing.assert_array_equal(stacks[0], stacks[1])
     np.testing.assert_array_equal(stacks[0], stacks[2])
-    assert (stacks[0][0] != stacks[0][1]).any()
+    assert all((of[0] != of[1]).any() for of in stacks)
 
 
 def test_a_refused_good_recording_and_an_error_beyond_the_bound_miss_their_targets():

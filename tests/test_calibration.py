@@ -135,7 +135,7 @@ def test_calibrations_that_are_given_twice_are_named_by_their_files(study, tmp_p
 
 def test_a_driver_is_written_with_its_calibrations_and_read_again(study, tmp_path):
     calibration = study["calibration/98k8"]
-    driver = etid.identify_driver(calibration, method="equation_error", throw=False)
+    driver = etid.identify_driver(calibration, method="steiglitz_mcbride", throw=False)
     driver.write(tmp_path / "driver.h5")
     with etid.read(tmp_path / "driver.h5") as written:
         [stored] = written.calibrations.recordings()

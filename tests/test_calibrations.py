@@ -50,7 +50,7 @@ def test_slopes_of_an_impedance_in_modal_form_are_those_of_jax():
     z, slopes = modal.with_slopes(parameters, 2, frequency)
     near(z, modal.impedance(parameters, 2, frequency))
     of_each = jax.vmap(jax.jacfwd(lambda p: modal.impedance(p, 2, jnp.asarray(frequency))))
-    near(slopes, np.moveaxis(of_each(jnp.asarray(parameters)), -1, -2))
+    near(slopes, np.moveaxis(jax.jit(of_each)(parameters), -1, -2))
 
 
 def test_slopes_of_the_prior_are_those_of_jax_also_where_z_th_is_not_passive(model):
@@ -59,7 +59,7 @@ def test_slopes_of_the_prior_are_those_of_jax_also_where_z_th_is_not_passive(mod
     q[model.source.gains] *= -1  # Re Z_th is negative at most frequencies
     terms, rows = prior.with_slopes(jnp.asarray(q))
     assert np.count_nonzero(terms[q.size :]) > 20
-    near(rows.T, jax.jacfwd(prior)(jnp.asarray(q)))
+    near(rows.T, jax.jit(jax.jacfwd(prior))(q))
 
 
 def test_a_start_does_not_depend_on_the_others_and_one_without_numbers_spoils_none(model, starts):

@@ -72,7 +72,7 @@ def driver():
 def test_nothing_changes_in_a_record_that_begins_in_a_pulse_or_on_its_tail(load, after):
     """Cuts are up to half a sample beside their place, and the voltage is steep there."""
     scene = dataclasses.replace(rung(load), start=TransformerDriver().lead_in + after)
-    for seed in range(5):
+    for seed in range(2):
         assert not change_of(trial(scene, seed), scene, LOADS[load]).seen
 
 
@@ -127,11 +127,11 @@ def test_the_standard_errors_of_changes_are_what_the_changes_scatter_by():
     off = []
     for load, skin in LOADS.items():
         scene, moves = rung(load), falling(skin, "r_p", 0.03)
-        for seed in range(10):
+        for seed in range(6):
             change = change_of(recorded(scene, moves, seed), scene, skin)
             off.append((change.size - [0, -0.03, 0, 0]) / change.stderr)
-    # Of 80 numbers, of which some 60 are independent: four standard errors of a standard deviation.
-    assert 0.64 < np.sqrt(np.mean(np.square(off))) < 1.36
+    # Of 48 numbers, of which some 36 are independent: four standard errors of a standard deviation.
+    assert 0.53 < np.sqrt(np.mean(np.square(off))) < 1.47
 
 
 @pytest.mark.parametrize(("freedom", "count"), [(1, 1), (1, 3), (4, 16), (9, 40)])
@@ -198,10 +198,9 @@ def test_what_does_not_change_raises_no_alarm(name):
     """However little a change would matter."""
     for load, skin in LOADS.items():
         scene = rung(load, **UNDISTURBED[name])
-        for seed in range(2):
-            change = change_of(trial(scene, seed), scene, skin)
-            assert not change.seen
-            assert (np.abs(change.size) < 6 * change.stderr).all()
+        change = change_of(trial(scene), scene, skin)
+        assert not change.seen
+        assert (np.abs(change.size) < 6 * change.stderr).all()
 
 
 @pytest.mark.parametrize("rate", [100e3, 200e3])
@@ -342,7 +341,7 @@ def test_noise_of_bands_is_that_of_their_second_differences():
     assert found == pytest.approx(0.5, rel=0.02)  # 80 000 differences know it to 0.5 %
 
 
-@pytest.mark.parametrize(("number", "path"), [(4, "damp"), (9, "dry"), (13, "damp")])
+@pytest.mark.parametrize(("number", "path"), [(4, "damp"), (9, "dry")])
 def test_aliases_of_a_card_without_a_filter_are_no_change(number, path):
     """With a clock 50 ppm fast, six periods are cut at six phases: those of fs + f show, too."""
     change = lab.lasting(20_000, lab.instrument("multifunction_card"))

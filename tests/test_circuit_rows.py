@@ -87,8 +87,11 @@ def logs_of(kind, *rows):
 
 @functools.cache
 def by_jax(kind):
+    """Impedance and its slopes of one row, and the response."""
+
     def both(logs, frequency):
-        return with_slopes(kind(), logs, frequency)
+        response = kind().with_log_values(logs).response(frequency)
+        return *with_slopes(kind(), logs, frequency), response
 
     return jax.jit(both)
 
@@ -104,7 +107,7 @@ def test_rows_of_numpy_equal_jax_row_by_row(kind):
     assert isinstance(value, np.ndarray)
     np.testing.assert_allclose(value, z, rtol=EXACT)
     for row in np.ndindex(2, 3):
-        expected, slopes = map(np.asarray, by_jax(kind)(logs[row], FREQUENCY))
+        expected, slopes, _ = map(np.asarray, by_jax(kind)(logs[row], FREQUENCY))
         np.testing.assert_allclose(z[row], expected, rtol=EXACT)
         largest = np.abs(slopes).max()
         np.testing.assert_allclose(by_element[row], slopes, rtol=0, atol=SLOPES * largest)
@@ -115,19 +118,23 @@ def test_rows_of_numpy_equal_jax_row_by_row(kind):
 
 @pytest.mark.parametrize("kind", [etid.SkinRC, etid.SkinCole, etid.Resistor])
 def test_jax_has_rows_too(kind):
-    logs = jnp.asarray(logs_of(kind, 2, 3))
-    z, by_element = with_slopes(kind(), logs, FREQUENCY)
-    assert isinstance(by_element, jax.Array)
-    expected, slopes = jax.vmap(jax.vmap(lambda of: with_slopes(kind(), of, FREQUENCY)))(logs)
-    np.testing.assert_allclose(z, expected, rtol=EXACT)
-    np.testing.assert_allclose(impedance_at(kind(), logs, FREQUENCY), expected, rtol=EXACT)
-    largest = np.abs(slopes).max()
-    np.testing.assert_allclose(by_element, slopes, rtol=0, atol=EXACT * largest)
-
     def level(logs):
         return jnp.sum(jnp.abs(impedance_at(kind(), logs, FREQUENCY)) ** 2)
 
-    gradient = jax.jit(jax.grad(level))(logs)
+    @jax.jit
+    def found(logs):
+        def both(logs):
+            return with_slopes(kind(), logs, FREQUENCY)
+
+        each = jax.vmap(jax.vmap(both))(logs)
+        return both(logs), impedance_at(kind(), logs, FREQUENCY), each, jax.grad(level)(logs)
+
+    logs = jnp.asarray(logs_of(kind, 2, 3))
+    (z, by_element), value, (expected, slopes), gradient = found(logs)
+    np.testing.assert_allclose(z, expected, rtol=EXACT)
+    np.testing.assert_allclose(value, expected, rtol=EXACT)
+    largest = np.abs(slopes).max()
+    np.testing.assert_allclose(by_element, slopes, rtol=0, atol=EXACT * largest)
     by_hand = 2 * np.real(np.conj(z)[..., None, :] * by_element).sum(-1)
     np.testing.assert_allclose(gradient, by_hand, rtol=1e-9, atol=1e-12 * np.abs(by_hand).max())
 
@@ -179,7 +186,7 @@ def test_the_limit_of_diffusion_at_no_frequency_is_its_resistor():
     # s τ is at most 1e-9, and its third is the relative change of Z.
     np.testing.assert_allclose(z, np.broadcast_to(total[:, None], z.shape), rtol=1e-9)
     np.testing.assert_allclose(by_element[:, 2], 0.0, atol=1e-9 * total.max())
-    expected, slopes = by_jax(etid.SkinWarburg)(logs[0], low)
+    expected, slopes, _ = by_jax(etid.SkinWarburg)(logs[0], low)
     np.testing.assert_allclose(z[0], expected, rtol=1e-11)  # 1 − e^(−2x) loses digits there
     np.testing.assert_allclose(by_element[0], slopes, rtol=0, atol=SLOPES * total.max())
 
@@ -189,7 +196,7 @@ def test_a_response_is_that_of_jax(kind):
     circuit = kind()
     found = circuit.response(FREQUENCY)
     assert isinstance(found, np.ndarray)
-    traced = jax.jit(lambda circuit, f: circuit.response(f))(circuit, jnp.asarray(FREQUENCY))
+    *_, traced = by_jax(kind)(circuit.log_values(), FREQUENCY)
     np.testing.assert_allclose(found, traced, rtol=EXACT)
     np.testing.assert_array_equal(circuit.response(jnp.asarray(FREQUENCY)), found)
     of_jax = kind.of_fit(map(jnp.asarray, circuit.values()))

@@ -300,7 +300,7 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
     run, study_file, tmp_path, monkeypatch
 ):
     def calibrated(records, order, former):
-        driver = etid.identify_driver(records, method="equation_error", throw=False)
+        driver = etid.identify_driver(records, method="steiglitz_mcbride", throw=False)
         return CheckedCalibration(driver, [1e-3], {})
 
     monkeypatch.setattr(calibrate, "calibrate", calibrated)
@@ -310,8 +310,6 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
     assert rows.keys() == cli.COMMANDS.keys()
     table = tmp_path / "t.csv"
     np.savetxt(table, np.ones((500, 2)), delimiter=",", header="open,skin", comments="")
-    with h5py.File(tmp_path / "p.h5", "w") as pulses:
-        pulses["v_out"] = np.zeros((1, 5000))
     names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
     rates = ("--sample-rate", 2e5, "--pulse-rate", 60)
     calls = {
@@ -320,20 +318,19 @@ def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(
         "check": (study_file,),
         "calibrate": (study_file, "-o", tmp_path / "driver.h5"),
         "import": (table, "-o", tmp_path / "i.h5", *names, *rates),
-        "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
+        "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "steiglitz_mcbride", "--order", 3),
         "report": (tmp_path / "f.h5",),
         "export": (tmp_path / "f.h5", "-o", tmp_path / "f.csv"),
-        "live": (study_file, "--file", tmp_path / "p.h5", "--electrodes", 1, "--port", 0),
     }
-    assert calls.keys() == cli.COMMANDS.keys()
+    assert calls.keys() == cli.COMMANDS.keys() - {"live"}  # of which `test_displays` reads the keys
     for command, arguments in calls.items():
         _, printed, _ = run(command, *arguments, "--json")
         told = set(re.findall(r"`(\w+)`", rows[command]))
         found = as_json(printed)
         assert set(found) - {"command", "status"} <= told, command
         if command == "fit":
-            assert (found["method"], found["drivers"][0]["order"]) == ("equation_error", 3)
-        written = {"check": "file", "report": "page", "live": "source"}.get(command, "target")
+            assert (found["method"], found["drivers"][0]["order"]) == ("steiglitz_mcbride", 3)
+        written = {"check": "file", "report": "page"}.get(command, "target")
         assert set(found) >= {"command", "status", written}
         inner = [item for value in found.values() if isinstance(value, list) for item in value]
         groups = [item for item in inner if isinstance(item, dict) and "subject" not in item]
@@ -362,18 +359,16 @@ def test_help_lists_every_command(run):
         assert any("--json" in line for line in printed)
 
 
-@pytest.mark.parametrize(
-    ("word", "status"), [("--help", DONE), ("--version", DONE), ("nonsense", WRONG_USAGE)]
-)
-def test_what_needs_no_command_is_answered_without_jax(word, status):
+def test_what_needs_no_command_is_answered_without_jax():
     code = f"""
 import sys
 from etid.__main__ import main
-sys.argv[1:] = [{word!r}]
-try:
-    main()
-except SystemExit as end:
-    assert end.code == {status}
+for word, status in ("--help", {DONE}), ("--version", {DONE}), ("nonsense", {WRONG_USAGE}):
+    sys.argv[1:] = [word]
+    try:
+        main()
+    except SystemExit as end:
+        assert end.code == status
 assert "etid.cli" in sys.modules
 assert not {{"jax", "equinox", "h5py"}} & set(sys.modules)
 """
@@ -418,7 +413,7 @@ def test_a_closed_stderr_and_another_encoding_stop_nothing(without_driver, tmp_p
     assert json.loads(done.stdout)["target"] == str(tmp_path / "Ω.h5")
 
 
-@pytest.mark.parametrize("arguments", ["check study.h5", "--version", "--completion bash"])
+@pytest.mark.parametrize("arguments", ["check study.h5", "--completion bash"])
 def test_a_reader_that_has_gone_is_no_error(tmp_path, arguments):
     read, write = os.pipe()
     os.close(read)

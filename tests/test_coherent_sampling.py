@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import etid
+import etid.display
 from benchmarks.ladder import CALIBRATION, recorded
 from benchmarks.perturbed_study import drawn_driver
 from etid.signals.harmonics import ALIASED, aliases
@@ -67,7 +68,7 @@ def test_without_a_filter_the_records_are_biased():
     assert set(joint.fits.verdicts) == {"driver_failed"}
     assert all("biased" in note for note in joint.fits.notes)
     with pytest.raises(etid.IdentificationError, match="biased"):
-        etid.Tracker.of(driver, study(False)[CALIBRATION], electrodes=1)
+        etid.display.Tracker.of(driver, study(False)[CALIBRATION], electrodes=1)
 
 
 @pytest.mark.parametrize(("rate", "pulses"), [(200e3, 50.0), (240e3, 60.0), (500e3, 50.0)])
@@ -76,7 +77,7 @@ def test_aliases_behind_a_filter_are_not_larger_than_estimated(rate, pulses, loa
     """Nor are they more than 20 times smaller where they matter most, at the highest harmonics."""
     size = round(rate / pulses)
     half = (size - 1) // 2
-    for number in range(10):
+    for number in range(4):
         of = scene(number, rate=rate, pulses=pulses).waveform()
         x, k = of.v_th, np.round(of.f / pulses).astype(int)
         if load != "open":

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import etid
+import etid.display
 from etid.simulation.calibration import CheckedCalibration
 
 ARRAYS = jax.Array | np.ndarray | np.generic
@@ -55,7 +56,7 @@ def objects():
     f = np.geomspace(1e2, 1e5, 20)
     z = np.asarray(etid.SkinRC().response(f))
     fits = etid.identify_skins([recording, recording.replace(path="b", subject="b")], driver)
-    tracker = etid.Tracker.of(driver, calibration, electrodes=2)
+    tracker = etid.display.Tracker.of(driver, calibration, electrodes=2)
     plain = etid.identify_driver(calibration, order=5, method="steiglitz_mcbride", throw=False)
     measured = etid.identify_impedance(f, z, stderr=0.01 * abs(z))
     selection = etid.select_circuit(recording, driver, candidates=[etid.SkinRC()])
@@ -90,7 +91,7 @@ def objects():
         CheckedCalibration(driver, [1e-3], {}),
         tracker,
         tracker.start(),
-        etid.Controller.of(tracker),
+        etid.display.Controller.of(tracker),
         etid.Instrument(gain=0.01),
         etid.Filter.of(np.array([1.0]), np.array([1.0, -0.5])),
         etid.Likelihood.of(
@@ -115,7 +116,6 @@ CIRCUITS = [
 ESTIMATORS = [
     etid.MaximumLikelihood,
     etid.OutputError,
-    etid.EquationError,
     etid.SteiglitzMcBride,
 ]
 
@@ -128,7 +128,8 @@ def public():
 
 
 def test_every_public_class_is_here(public):
-    classes = {of for name in etid.__all__ if inspect.isclass(of := getattr(etid, name))}
+    named = [getattr(of, name) for of in (etid, etid.display) for name in of.__all__]
+    classes = {of for of in named if inspect.isclass(of)}
     wanted = {of for of in classes if not inspect.isabstract(of)}
     missing = {of for of in wanted if not any(isinstance(one, of) for one in public)}
     assert missing == set()

@@ -1,6 +1,6 @@
 """The table of directions: each row is a change of the gains, a fault to simulate, and a test."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 import scipy.stats
@@ -66,14 +66,19 @@ def test_rows_and_jax_have_the_same_changes():
         return impedance_at(SkinRC(), logs * np.ones((*f.shape[:-1], 1)), f)
 
     rows = At.behind(np.stack([F, 1.1 * F]), np.stack([Z_TH, Z_TH]), impedance)
-    in_jax = At.behind(jnp.asarray(F), jnp.asarray(Z_TH), impedance)
+
+    @jax.jit
+    def of_jax(f, z_th):
+        at = At.behind(f, z_th, impedance)
+        return {name: DIRECTIONS[name].change(at) for name in scored()}
+
+    in_jax = of_jax(F, Z_TH)
     for name in scored():
         expected = DIRECTIONS[name].change(one)
         np.testing.assert_allclose(DIRECTIONS[name].change(rows)[0], expected, rtol=1e-12)
         # JAX and NumPy differ in the last digits of |z| and of 1/z.
         size = np.max(np.abs(expected), initial=0.0)
-        found = DIRECTIONS[name].change(in_jax)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * size)
+        np.testing.assert_allclose(in_jax[name], expected, rtol=0, atol=1e-9 * size)
 
 
 def fits_of(change, number=11, snr_db=60.0):
@@ -158,13 +163,13 @@ def test_a_capacitance_is_seen_behind_most_drivers_and_in_no_good_recording():
 
 
 def test_limits_follow_the_deviation_of_good_recordings():
-    """Of 48 recordings of drawn drivers; `python -m benchmarks directions` has many more.
+    """Of 16 recordings of drawn drivers; `python -m benchmarks directions` has many more.
 
-    The root mean square of 48 normal numbers exceeds 1.35 once in 5000, and of those of which most
+    The root mean square of 16 normal numbers exceeds 1.67 once in 5000, and of those of which most
     are 0, because they move no element, it is smaller.
     """
     z = {name: [] for name in named()}
-    for number in range(40, 64):
+    for number in range(40, 48):
         for fit in fits_of(lambda of: of, number).values():
             assert fit.verdict == "successful"
             for name, scores in z.items():
@@ -173,4 +178,4 @@ def test_limits_follow_the_deviation_of_good_recordings():
         of = DIRECTIONS[name]
         exceeds = scipy.stats.norm.sf(of.limit / of.deviation) * 2 * of.count
         assert exceeds == pytest.approx(FALSE_ALARMS)
-        assert np.sqrt(np.mean(np.square(scores), axis=0)).max() < 1.35 * of.deviation
+        assert np.sqrt(np.mean(np.square(scores), axis=0)).max() < 1.67 * of.deviation

@@ -105,7 +105,7 @@ def test_a_current_without_a_signal_is_left_out(recording, driver, level, noise)
     rng = np.random.default_rng(0)
     dead = [
         recording.replace(current=level + noise * rng.standard_normal(recording.v_out.size))
-        for _ in range(5)
+        for _ in range(2)
     ]
     fits = [etid.identify_skin(dead[0], driver), *etid.identify_skins(dead, driver)]
     for fit in fits:

@@ -37,7 +37,7 @@ def test_errors_contain_those_of_the_analyser():
     """At 80 dB nearly all of them are its errors, one draw for each skin."""
     rng, squares = np.random.default_rng(3), []
     records = {name: study(name, snr_db=80.0) for name in ("dry", "damp")}
-    for _ in range(40):
+    for _ in range(20):
         noise = rng.standard_normal((2, F.size))
         z_th = Z_TH * np.exp(0.003 * (noise[0] + 1j * noise[1]))
         driver = etid.driver_of_response(F, z_th, sample_rate=RATE, stderr=0.003)
@@ -45,23 +45,23 @@ def test_errors_contain_those_of_the_analyser():
         for one, truth in records.values():
             fit = etid.identify_skin(one, driver)
             squares.append(((fit.circuit.values() - truth) / fit.stderr.values()) ** 2)
-    # Chi-square of 40 draws: 0.999 of its means are within 0.42 and 1.8.
-    assert ((np.mean(squares, 0) > 0.42) & (np.mean(squares, 0) < 1.8)).all()
+    # Chi-square of 20 draws: 0.999 of its means are within 0.27 and 2.4.
+    assert ((np.mean(squares, 0) > 0.27) & (np.mean(squares, 0) < 2.4)).all()
 
 
 def test_standard_errors_of_z_th_are_those_of_the_analyser():
     rng, found = np.random.default_rng(5), []
     at = np.array([300.0, 3e3, 3e4])
     true = TransformerDriver().z_th(at)
-    for _ in range(40):
+    for _ in range(20):
         noise = rng.standard_normal((2, F.size))
         z_th = Z_TH * np.exp(0.01 * (noise[0] + 1j * noise[1]))
         driver = etid.driver_of_response(F, z_th, sample_rate=RATE, stderr=0.01)
         off = np.log(driver.response(at) / true)
         found.append(np.stack([off.real, off.imag]) / driver.log_response_stderr(at))
     # 1.1 to 1.2 in the mean of 120 draws: poles that little shows follow the noise. The six numbers
-    # of a draw depend on each other; chi-square of 80 has 0.999 of its means below 1.55.
-    assert 0.6 < np.mean(np.square(found)) < 1.55
+    # of a draw depend on each other; chi-square of 40 has 0.999 of its means below 1.84.
+    assert 0.44 < np.mean(np.square(found)) < 1.84
 
 
 def test_too_few_poles_are_a_misfit():

@@ -28,14 +28,22 @@ sys.exit(main())
 
 
 @pytest.mark.parametrize(
-    ("module", "how"), [("jax", "raised"), ("jax", "lost"), ("etid.commands.report", "raised")]
+    ("program", "module", "how"),
+    [
+        ("etid", "jax", "raised"),
+        ("etid", "jax", "lost"),
+        ("etid", "etid.commands.report", "raised"),
+        ("etid-live", "etid.display.command", "raised"),
+    ],
 )
-def test_ctrl_c_during_the_imports_is_one_line(module, how):
+def test_ctrl_c_during_the_imports_is_one_line(program, module, how):
+    package = {"etid": "etid", "etid-live": "etid.display"}[program]
+    code = EARLY.replace("from etid.", f"from {package}.")
     done = subprocess.run(
-        [sys.executable, "-c", EARLY, module, how], capture_output=True, text=True, check=False
+        [sys.executable, "-c", code, module, how], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr == "etid: interrupted: nothing was changed\n"
+    assert done.stderr == f"{program}: interrupted: nothing was changed\n"
 
 
 def test_a_program_in_the_background_is_not_interrupted():

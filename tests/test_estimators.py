@@ -122,9 +122,10 @@ def test_options_are_fields_which_fits_and_their_methods_section_keep(study):
 
 
 def test_the_instance_of_a_name_is_the_same_method(study):
-    assert Options.of(method="equation_error").estimator == etid.EquationError()
-    driver = etid.identify_driver(study["calibration/0"], method=etid.EquationError(), throw=False)
-    assert driver.method == "equation_error"
+    assert Options.of(method="steiglitz_mcbride").estimator == etid.SteiglitzMcBride()
+    first = etid.SteiglitzMcBride(iterations=1)
+    driver = etid.identify_driver(study["calibration/0"], method=first, throw=False)
+    assert driver.method == str(first) == "steiglitz_mcbride(iterations=1)"
     records = [study[path] for path in study.loaded]
     few = etid.SteiglitzMcBride(iterations=3)
     fits = etid.identify_skins(records, driver, method=few)

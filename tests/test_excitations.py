@@ -82,8 +82,7 @@ def test_a_flat_multisine_is_fitted_to_its_noise(rate):
     assert np.abs((fit.circuit.values() - TRUTH) / errors).max() < 4
 
 
-@pytest.mark.parametrize("rate", [50.0, 60.0])
-@pytest.mark.parametrize("kind", WAVES)
+@pytest.mark.parametrize(("kind", "rate"), [*zip(WAVES, [50.0, 60.0] * 4, strict=True)])
 def test_one_period_of_any_waveform_is_fitted(kind, rate):
     """Two crests of a chirp or of a 1/f multisine were pulses of another rate: `rate_mismatch`."""
     fit = etid.identify_skin(recorded(kind, 1, 2, rate)[0])

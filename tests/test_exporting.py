@@ -1,33 +1,24 @@
 """Exported files, read back by the programs they are for."""
 
-import contextlib
 import csv
 import dataclasses
-import datetime
 import json
 import re
 import sys
-from collections.abc import Iterator
-from typing import Any
 
 import h5py
 import numpy as np
 import pandas
-import pynwb
 import pytest
 from pyarrow import parquet
 
 import etid
 from etid import cli
 from etid.files import exporting
-from etid.recordings.recording import Samples
 from etid.results.fit import Limited
 from etid.results.fits import Fits
-from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
 from tests import pictures
 
-START = datetime.datetime(2026, 1, 31, 9, 30, tzinfo=datetime.UTC)
 COUNT = 12
 ELEMENTS = {"r_s": "ohm", "r_p": "ohm", "c_p": "farad"}
 
@@ -177,86 +168,11 @@ def test_a_circuit_that_is_not_there_or_no_success_is_not_written(path, words, f
         assert not (tmp_path / f"a{suffix}").exists()
 
 
-@contextlib.contextmanager
-def opened(path) -> Iterator[Any]:
-    """An NWB file as pynwb reads it."""
-    io: Any = pynwb.NWBHDF5IO  # whose arguments and results a type checker cannot see
-    with io(path, "r") as content:
-        yield content.read()
-
-
-@pytest.fixture
-def study_file(tmp_path):
-    """A calibration and two trials that share an unloaded record; one more with a current."""
-    trials = tuple(
-        Trial(f"s01/dry/{i}", ResistorLoad(1e4), "s01", "dry", trial=str(i)) for i in range(2)
-    )
-    known = (Trial("calibration/98k8", ResistorLoad(98.8e3), "s01"),)
-    shared = Scene(trials, known, samples=400, shared_v_th=True).simulate(1)
-    v_th, v_out, current = np.random.default_rng(2).normal(size=(3, 400))
-    codes = Samples((1000 * v_out).astype("i2"), 1e-3, 0.25)  # a converter whose zero is not 0 V
-    damp = etid.Recording(v_th, codes, current=current, path="s01/damp", electrode="E1",
-                          subject="s01", sample_rate=200e3, pulse_rate=60.0)  # fmt: skip
-    etid.Study.from_recordings([*shared.recordings(), damp]).write(tmp_path / "study.h5")
-    return tmp_path / "study.h5"
-
-
-def test_nwb_holds_what_was_stored_and_all_that_was_said(study_file, tmp_path):
-    target = tmp_path / "study.nwb"
-    etid.export_study(study_file, target, session_start=START)
-    assert pynwb.validate(path=str(target)) == []
-    with opened(target) as file, etid.read(study_file) as study:
-        assert file.session_start_time == START
-        assert file.subject.subject_id == "s01"
-        table = file.acquisition["recordings"].to_dataframe().set_index("path")
-        assert list(table.index) == list(study)
-        assert study["s01/damp"].samples["v_out"].offset == 0.25
-        for path, recording in study.items():
-            row = table.loc[path]
-            for name, record in recording.samples.items():
-                series = file.acquisition[row[name]]
-                assert row[name] == f"{path}/{name}".replace("/", ".")
-                np.testing.assert_array_equal(series.data[:], record.stored)
-                assert series.data.dtype == record.stored.dtype
-                unit = "ampere" if name == "current" else "volt"
-                assert (series.conversion, series.offset) == (record.conversion, record.offset)
-                assert (series.unit, series.rate) == (unit, recording.sample_rate)
-            assert row["current"] == (
-                "" if recording.current is None else f"{row.v_out[:-5]}current"
-            )
-            for name in ("kind", "subject", "condition", "electrode", "trial", "pulse_rate"):
-                assert row[name] == getattr(recording.metadata, name), name
-            assert tuple(row["calibration"].splitlines()) == recording.calibration
-            limits = recording.adc_range or (np.nan, np.nan)
-            np.testing.assert_array_equal(row["adc_range"], limits)
-            load = np.nan if recording.r_load is None else recording.r_load
-            np.testing.assert_array_equal(row["r_load"], load)
-
-
-def test_a_recording_that_cannot_be_read_is_not_left_out_silently(study_file, tmp_path):
-    with h5py.File(study_file, "a") as file:
-        del file["s01/damp/v_out"]
-    with pytest.raises(etid.RecordingError, match="'s01/damp', v_out: is missing"):
-        etid.export_study(study_file, tmp_path / "study.nwb", session_start=START)
-    assert not (tmp_path / "study.nwb").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "package", "extra"),
-    [
-        ("fits.h5 -o t.parquet", "pyarrow", "parquet"),
-        ("study.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "pynwb", "nwb"),
-    ],
-)
-def test_a_missing_package_is_named_with_its_extra(
-    arguments, package, extra, file, study_file, tmp_path, monkeypatch, capsys
-):
+def test_a_missing_package_is_named_with_its_extra(file, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(sys.modules, "etid.files.nwb", raising=False)
-    monkeypatch.setitem(sys.modules, package, None)
-    assert cli.main(["export", *arguments.split()]) == 1
-    words = rf"needs the package {package}.*'etid\[{extra}"
-    assert re.search(words, capsys.readouterr().err)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert cli.main(["export", "fits.h5", "-o", "t.parquet"]) == 1
+    assert re.search(r"needs the package pyarrow.*'etid\[parquet", capsys.readouterr().err)
     assert [*tmp_path.glob("t.*")] == []
 
 
@@ -268,11 +184,7 @@ def test_a_missing_package_is_named_with_its_extra(
         ("study.h5 -o t.csv", "schema: is 'etid/recording', not 'etid/fits'"),
         ("fits.h5 -o t.xlsx", "t.xlsx: the file is not written as .xlsx; name it t.csv"),
         ("fits.h5 -o t.abc", "t.abc: fits are exported as .csv or .parquet, not '.abc'"),
-        ("fits.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "schema: is a file of fits"),
-        ("absent.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "no such file"),
-        ("empty.h5 -o t.nwb --session-start 2026-01-31T09:30Z", "empty.h5: holds no recording"),
-        ("study.h5 -o t.nwb", "session_start: is not given with a time zone"),
-        ("fits.h5 -o t.csv --session-start 2026-01-31", "--session-start is only for .nwb"),
+        ("study.h5 -o t.nwb", "t.nwb: the file is not written as .nwb; name it t.csv"),
         ("fits.h5 -o t.csv --path path", "t.csv: --path is only for .cir and"),
         ("fits.h5 -o t.cir", "say which recording"),
         ("short.h5 -o t.csv", "chi2: the column is missing"),
@@ -280,12 +192,10 @@ def test_a_missing_package_is_named_with_its_extra(
         ("fits.h5 -o t.cir --all", "t.cir: --all is only for .csv and .parquet"),
     ],
 )
-def test_what_cannot_be_exported_is_one_line(
-    arguments, words, file, study_file, tmp_path, monkeypatch, capsys
-):
+def test_what_cannot_be_exported_is_one_line(arguments, words, file, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "garbage.h5").write_bytes(b"no HDF5")
-    etid.Study({}).write(tmp_path / "empty.h5")
+    etid.Study({}).write(tmp_path / "study.h5")
     (tmp_path / "short.h5").write_bytes(file.read_bytes())
     with h5py.File(tmp_path / "short.h5", "a") as content:
         del content["chi2"]

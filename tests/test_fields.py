@@ -6,8 +6,6 @@ import shutil
 import subprocess
 import sys
 
-from etid.recordings import fields
-
 ROOT = pathlib.Path(__file__).parents[1]
 BEFORE = "    adc_range: tuple[float, float] | None"
 NEW = """\
@@ -104,9 +102,3 @@ def test_a_new_field_passes_through_everything_from_its_declaration_alone(tmp_pa
         check=False,
     )
     assert done.returncode == 0, done.stderr
-
-
-def test_type_checkers_know_the_names_of_all_fields():
-    assert fields.Given.__annotations__.keys() == {"path", *fields.DECLARED}
-    always = {name for name, field in fields.DECLARED.items() if field.required == "always"}
-    assert fields.Given.__required_keys__ == always

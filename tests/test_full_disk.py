@@ -82,7 +82,6 @@ def on_disk_of():
         ("export", "out.csv", (0, 0.5)),
         ("export", "out.parquet", (0, 0.5, 0.999)),
         ("export", "out.cir", (0.5,)),
-        ("export", "out.nwb", (0, 0.3, 0.5, 0.9, 0.999)),
     ],
 )
 def test_a_full_disk_ends_a_command_in_one_line_and_changes_no_file(
@@ -98,9 +97,6 @@ def test_a_full_disk_ends_a_command_in_one_line_and_changes_no_file(
     }[command]
     if name == "out.cir":
         arguments += ("--path", "loaded/0")
-    if name == "out.nwb":
-        start = ("--session-start", "2026-01-31T09:30:00+01:00")
-        arguments = ("export", study, "-o", target, *start)
     unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
     assert on_disk_of(unlimited, *arguments)[0] == 0
     before = target.read_bytes()

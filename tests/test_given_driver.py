@@ -38,13 +38,12 @@ def information(driver):
         z = jnp.asarray(unflatten(p[:-1]).response(f))
         return delayed(R_LOAD / (R_LOAD + z), jnp.asarray(f), p[-1], jnp.asarray(rate))
 
-    slopes = np.asarray(jax.jacfwd(gain)(at)).T
+    slopes = np.asarray(jax.jit(jax.jacfwd(gain))(at)).T
     variance = (sigma_out**2 + np.abs(np.asarray(gain(at))) ** 2 * sigma_th**2) / size
     weight = np.where(selected, 2 * np.abs(x) ** 2 / variance, 0.0)
     told = np.real((slopes * weight) @ slopes.conj().T)
-    weak = jax.jacfwd(SourcePrior.of(driver.source, jnp.asarray(rate), jnp.asarray(R_LOAD)))(
-        parameters
-    )
+    prior = SourcePrior.of(driver.source, jnp.asarray(rate), jnp.asarray(R_LOAD))
+    weak = jax.jit(jax.jacfwd(prior))(parameters)
     told[:-1, :-1] += np.asarray(weak.T @ weak)
     told[-1, -1] += 1 / DELAY_WIDTH**2
     return told

@@ -96,17 +96,17 @@ def test_images_make_a_discretisation_of_a_response(resonates):
 def test_a_held_current_shows_the_load(kind, size):
     """Whole periods and not; the command has no noise.
 
-    The three errors of a fit are nearly one. 24 independent squares have a root of the mean of
-    1 ± 0.14; the limits are three of these.
+    The three errors of a fit are nearly one. 12 independent squares have a root of the mean of
+    1 ± 0.2; the limits are three of these.
     """
     numerator, denominator = polynomials()[0]
     errors = []
-    for seed in range(24):
+    for seed in range(12):
         one = recorded(kind, size, seed, (numerator.c, denominator.c), current=True)
         fit = etid.identify_skin(one)
         assert (np.array(fit.stderr.values()) < 0.01 * SKIN).all()
         errors.append(off(fit))
-    assert 0.57 < np.sqrt(np.mean(np.square(errors))) < 1.43
+    assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.6
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """Tolerances of the instrument: in the standard errors, in a budget, and in files."""
 
 import dataclasses
-import datetime
 import functools
 from typing import Any
 
@@ -13,15 +12,16 @@ import pytest
 import scipy.stats
 
 import etid
+import etid.display
 from etid import cli
 from etid.circuits.circuit import AbstractCircuit, Farad, Ohm, parameter
 from etid.circuits.elements import capacitor, resistor
 from etid.circuits.impedance import parallel, series
+from etid.display.current import CurrentModel
 from etid.estimators.maximum_likelihood.given_driver import given
 from etid.estimators.maximum_likelihood.rows import source_of
 from etid.likelihood.calibrations import Calibrations
 from etid.likelihood.gains import Gains
-from etid.online.current import CurrentModel
 from etid.precision import array_function
 from etid.recordings.remarks import Remark
 from etid.results.driver import ContinuousDriver, HarmonicDriver
@@ -36,7 +36,6 @@ GAIN = etid.Instrument(gain=1e-3)
 ALL = etid.Instrument(gain=2e-3, r_load=2e-3, c_load=1e-12, crosstalk=2e-3, capacitance=2e-12)
 DRAWS = 40
 STUDIES = 16  # of ten fits each
-SINCE = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 CHARGE = 1e-7  # [C] of the size of a phase
 NORMAL_95 = scipy.stats.norm.ppf(0.975)
 
@@ -257,7 +256,7 @@ def test_an_instrument_is_a_field_of_the_calibrations(tmp_path):
     assert again.instrument.stored() == {"gain": 1e-3}
 
 
-def test_a_file_with_an_instrument_is_checked_exported_and_fitted_otherwise(tmp_path, capsys):
+def test_a_file_with_an_instrument_is_checked_and_fitted_otherwise(tmp_path, capsys):
     calibration, skin = exact()
     file = tmp_path / "study.h5"
     etid.Study.from_recordings([calibration.replace(instrument="delay=5ns"), skin]).write(file)
@@ -269,8 +268,6 @@ def test_a_file_with_an_instrument_is_checked_exported_and_fitted_otherwise(tmp_
     with etid.read(file) as study:
         fits = etid.identify_jointly(study, instrument=GAIN)  # what is passed counts
         assert fits.fits.verdicts == ["successful"]
-        etid.export_study(file, tmp_path / "study.nwb", session_start=SINCE)
-    assert (tmp_path / "study.nwb").exists()
 
 
 @pytest.mark.parametrize("resistors", [(R_LOAD,), (R_LOAD, 21.62e3)])
@@ -380,7 +377,7 @@ def tracked(calibration, skin, instrument):
     Ten electrodes, as in other tests: the program for them is compiled.
     """
     driver = etid.identify_driver(calibration, instrument=instrument)
-    tracker = etid.Tracker.of(driver, calibration, electrodes=10)
+    tracker = etid.display.Tracker.of(driver, calibration, electrodes=10)
     state = tracker.start()
     for v_out in tracker.pulses(np.tile(skin.v_out, (10, 1))):
         state = tracker.update(state, v_out)
@@ -412,7 +409,7 @@ def test_a_stated_delay_is_no_help_to_a_tracker_whose_windows_begin_between_two_
     found = []
     for instrument in (None, etid.Instrument(delay=5e-9)):
         driver = etid.identify_driver(calibration, instrument=instrument)
-        tracker = etid.Tracker.of(driver, calibration, electrodes=10)
+        tracker = etid.display.Tracker.of(driver, calibration, electrodes=10)
         state = tracker.start()
         for v_out in tracker.pulses(np.tile(skin.v_out, (10, 1))):
             state = tracker.update(state, v_out)

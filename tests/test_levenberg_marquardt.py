@@ -1,6 +1,7 @@
 """The search that all fits share: its minima, its steps, and what must not stop it."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -39,6 +40,12 @@ def powell(y):
     return jnp.stack([*first, (y[1] - 2 * y[2]) ** 2, np.sqrt(10.0) * (y[0] - y[3]) ** 2])
 
 
+@functools.cache
+def with_slopes(residual):
+    """Of rows, compiled as a whole."""
+    return jax.jit(jax.vmap(lambda *row: (residual(*row), jax.jacfwd(residual)(*row))))
+
+
 @dataclasses.dataclass(frozen=True)
 class Terms:
     """Residuals of rows, each with its own data if there are any."""
@@ -50,7 +57,7 @@ class Terms:
     def equations(self, q):
         """The normal equations."""
         rows = (q,) if self.data is None else (q, self.data)
-        found = [jax.vmap(one)(*rows) for one in (self.residual, jax.jacfwd(self.residual))]
+        found = with_slopes(self.residual)(*rows)
         terms, slopes = map(np.asarray, found) if self.in_numpy else found
         return NormalEquations.of(terms, slopes.swapaxes(-1, -2))
 

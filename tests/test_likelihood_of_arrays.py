@@ -67,10 +67,15 @@ def test_its_terms_are_its_logarithm(study, driver, last):
 
 def test_its_minimum_is_the_fit(study, driver):
     likelihood = of(driver, study[PATHS[0]])
-    residual, q = jax.jit(likelihood.residual), jnp.asarray(likelihood.start())
+
+    @jax.jit
+    def step(q):
+        slopes = jax.jacfwd(likelihood.residual)(q)
+        return q - jnp.linalg.solve(slopes.T @ slopes, slopes.T @ likelihood.residual(q))
+
+    q = jnp.asarray(likelihood.start())
     for _ in range(4):
-        slopes = jax.jacfwd(residual)(q)
-        q = q - jnp.linalg.solve(slopes.T @ slopes, slopes.T @ residual(q))
+        q = step(q)
     fit = likelihood.fit()
     off = (np.array(likelihood.circuit(q).values()) - fit.circuit.values()) / fit.stderr.values()
     assert np.abs(off).max() < 0.01  # where a search ends, in standard errors
@@ -82,19 +87,24 @@ def test_its_minimum_is_the_fit(study, driver):
 def test_numpy_and_jax_have_the_same_numbers_and_derivatives(study, driver):
     likelihood = of(driver, study[PATHS[2]])
     circuit = likelihood.circuit(likelihood.start())
-    traced = jax.jit(likelihood.log_prob)
-    as_jax = jax.tree.map(jnp.asarray, circuit)
-    assert traced(as_jax, 1e-8) == pytest.approx(likelihood.log_prob(circuit, 1e-8), rel=1e-9)
-    slope = jax.grad(lambda log: likelihood.log_prob(circuit.of_fit(jnp.exp(log)), 1e-8))
     logs, step = np.asarray(circuit.log_values()), 1e-6
+
+    @jax.jit
+    @jax.value_and_grad
+    def traced(logs):
+        return likelihood.log_prob(circuit.of_fit(jnp.exp(logs)), 1e-8)
+
+    value, slope = traced(jnp.asarray(logs))
+    assert value == pytest.approx(likelihood.log_prob(circuit, 1e-8), rel=1e-9)
     numeric = [
         (likelihood.log_prob(circuit.of_fit(np.exp(logs + step * e)), 1e-8)
          - likelihood.log_prob(circuit.of_fit(np.exp(logs - step * e)), 1e-8)) / (2 * step)
         for e in np.eye(3)
     ]  # fmt: skip
-    np.testing.assert_allclose(slope(jnp.asarray(logs)), numeric, rtol=1e-4, atol=1e-2)
+    np.testing.assert_allclose(slope, numeric, rtol=1e-4, atol=1e-2)
 
 
+@pytest.mark.slow  # `test_samples` maps the same program; this one takes twenty seconds to compile
 def test_fits_of_mapped_arrays(study, driver):
     both = [jnp.stack([getattr(study[path], name) for path in PATHS]) for name in ("v_th", "v_out")]
     fit = lambda v_th, v_out: etid.Likelihood.of(v_th, v_out, driver, **RATES).fit()  # noqa: E731
@@ -164,6 +174,8 @@ def test_refusals(study):
         ({"sample_rate": 60.0, "pulse_rate": 200e3}, "pulses must be slower than samples"),
         ({"pulse_rate": 0.0}, "pulse_rate 0 Hz"),
         ({"resolution": -1.0}, "resolution -1 V"),
+        ({"v_th": np.append(np.zeros(9_998), [np.nan, np.inf])}, "v_th has 2 values that are not"),
+        ({"v_out": np.append(np.zeros(9_999), np.nan)}, "v_out has 1 value that is not finite"),
     ],
 )
 def test_what_cannot_be_is_refused(study, driver, changed, words):

@@ -173,12 +173,11 @@ def test_a_joint_fit_leaves_hum_out():
 @pytest.mark.parametrize("added", [hum(50.0, 0.05), hum(60.0, 0.1), hum(1.0, 0.5)])
 def test_hum_and_wander_are_among_the_states_of_a_record_that_is_not_whole_periods(added, samples):
     """In all records; without such states the driver takes them, or the search does not end."""
-    for number in range(2):
-        study = perturbed_study.lasting(samples)(perturbed_study.undisturbed(number, 60.0))
-        disturbed = all_records(both(added=(added,)))(study).recordings()
-        driver = etid.identify_driver(list(disturbed.calibrations.recordings()))
-        for path, load in LOADS.items():
-            fit = etid.identify_skin(disturbed[path], driver)
-            assert fit.verdict == "successful"
-            # 36 normal numbers for each length: one in 400 such tests.
-            assert (np.abs(off(fit, load)) < 4).all()
+    study = perturbed_study.lasting(samples)(perturbed_study.undisturbed(0, 60.0))
+    disturbed = all_records(both(added=(added,)))(study).recordings()
+    driver = etid.identify_driver(list(disturbed.calibrations.recordings()))
+    for path, load in LOADS.items():
+        fit = etid.identify_skin(disturbed[path], driver)
+        assert fit.verdict == "successful"
+        # 18 normal numbers for each length: one in 800 such tests.
+        assert (np.abs(off(fit, load)) < 4).all()

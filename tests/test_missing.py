@@ -8,7 +8,7 @@ import pytest
 
 import etid
 from etid.signals.missing import unmasked
-from tests.test_online import TEN, quiet, tracker_of
+from tests.display.test_online import TEN, quiet, tracker_of
 
 RATES: dict[str, Any] = {"sample_rate": 200e3, "pulse_rate": 60.0}
 F = np.geomspace(60.0, 1e5, 40)

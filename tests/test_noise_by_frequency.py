@@ -3,7 +3,7 @@
 import functools
 import json
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 import scipy.signal
@@ -48,8 +48,7 @@ def pulses(samples, ppm=0.0, width=667e-6):
 
 
 @pytest.mark.parametrize("kind", FILTERS)
-@pytest.mark.parametrize("samples", [6667, 10_000, 13_333, 20_000])
-@pytest.mark.parametrize("ppm", [0.0, 20.0])
+@pytest.mark.parametrize(("samples", "ppm"), [(6667, 20.0), (10_000, 0.0), (20_000, 20.0)])
 def test_noise_is_measured_at_each_frequency(kind, samples, ppm):
     """Differences of samples saw a quarter of the noise that a filter of 45 kHz has passed."""
     rng = np.random.default_rng([samples, int(ppm)])
@@ -164,7 +163,7 @@ def test_jax_and_numpy_measure_the_same(periods):
     rng = np.random.default_rng(5)
     samples = round(periods * RATE / PULSES)
     v = pulses(samples) + SIGMA * rng.standard_normal(samples)
-    power = np.asarray(noise_of(jnp.asarray(v), periods, samples).power)
+    power = jax.jit(lambda v: noise_of(v, periods, samples).power)(v)
     np.testing.assert_allclose(power, noise_of(v, periods, samples).power, rtol=1e-3)
 
 

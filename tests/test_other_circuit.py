@@ -143,7 +143,7 @@ def test_a_relaxation_that_the_circuit_has_is_none():
     def impedance(log_values):
         return real(circuit.with_log_values(log_values).impedance()(jnp.asarray(2j * np.pi * f)))
 
-    jacobian = jax.jacfwd(impedance)(circuit.log_values()).T
+    jacobian = jax.jit(jax.jacfwd(impedance))(circuit.log_values()).T
     term = DIRECTIONS["relaxation"].term
     assert term is not None
     rows = real(jnp.asarray(term(place(circuit, f))))

@@ -115,21 +115,22 @@ OUTPUTS = {
         "export fits.h5 -o fits.xyz",
         "export example.h5 -o fits.csv",
     ]),
-    "live": (False, [
-        "live one.h5 --file pulses.h5 --electrodes 2 --speed 50 --port 0",
-        "live one.h5 --file pulses.h5 --electrodes 3 --port 0",
-        "live one.h5 --file absent.h5 --electrodes 2 --port 0",
-        "live loaded.h5 --file pulses.h5 --port 0",
-        "live one.h5 --socket localhost --electrodes 2 --port 0",
-        "live one.h5 --port 0",
-    ]),
     "no_command": (False, ["", "nonsense", "--help"]),
     "help": (False, [
         f"{name} --help" for name in (
-            "import", "calibrate", "check", "fit", "report", "export", "merge", "live", "simulate",
+            "import", "calibrate", "check", "fit", "report", "export", "merge", "simulate",
         )
     ]),
 }  # fmt: skip
+OF_ETID_LIVE = (
+    "one.h5 --file pulses.h5 --electrodes 2 --speed 50 --port 0",
+    "one.h5 --file pulses.h5 --electrodes 3 --port 0",
+    "one.h5 --file absent.h5 --electrodes 2 --port 0",
+    "loaded.h5 --file pulses.h5 --port 0",
+    "one.h5 --socket localhost --electrodes 2 --port 0",
+    "one.h5 --port 0",
+    "--help",
+)
 
 
 def _recordings(scene, seed=1):
@@ -217,6 +218,11 @@ def test_what_a_command_prints(name, place):
     fitted, commands = OUTPUTS[name]
     shown = printed.masked(printed.transcript(*commands), place)
     printed.check(name, shown, fitted=fitted)
+
+
+def test_what_etid_live_prints(place):
+    shown = printed.transcript(*OF_ETID_LIVE, program="etid-live")
+    printed.check("live", printed.masked(shown, place), fitted=False)
 
 
 @pytest.mark.parametrize("options", ["", " --long", " --all"])

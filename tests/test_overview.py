@@ -14,7 +14,7 @@ import pytest
 import etid
 from etid.circuits.display import between, quantity
 from etid.circuits.overview import ROWS, Overview
-from etid.online.state import Change
+from etid.display.state import Change
 from etid.recordings.remarks import Remark
 from etid.results.data import MeasuredImpedance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance

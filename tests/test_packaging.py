@@ -71,8 +71,8 @@ def test_the_conda_recipe_says_what_the_project_says(project):
     assert f">={recipe['context']['python_min']}" == project["requires-python"]
     assert recipe["about"]["summary"] == project["description"]
     assert recipe["about"]["license"] == project["license"]
-    (entry,) = recipe["build"]["python"]["entry_points"]
-    assert entry == f"etid = {project['scripts']['etid']}"
+    scripts = [f"{name} = {place}" for name, place in project["scripts"].items()]
+    assert recipe["build"]["python"]["entry_points"] == scripts
     named = {"matplotlib-base": "matplotlib"}  # what conda-forge calls it without Qt
     needed = [one.partition(" ") for one in recipe["requirements"]["run"][1:]]
     assert [named.get(name, name) + bound for name, _, bound in needed] == project["dependencies"]
@@ -102,7 +102,7 @@ def test_importing_prints_nothing_and_changes_no_setting():
     code = """
 import jax
 before = dict(jax.config.values)
-import sys, etid
+import sys, etid, etid.display
 etid.read
 from jax._src import xla_bridge
 assert dict(jax.config.values) == before

@@ -15,7 +15,6 @@ DRIVERS = {
     "maximum_likelihood": "maximum_likelihood",
     "output_error": "maximum_likelihood",
     "steiglitz_mcbride": "steiglitz_mcbride",
-    "equation_error": "steiglitz_mcbride",
 }
 
 

@@ -166,7 +166,7 @@ def test_a_fit_knows_its_recording_and_what_is_made_from_it_does_not(clear):
     ]
     np.testing.assert_equal(lines[0], lines[1])
     np.testing.assert_equal(lines[0], lines[2])
-    assert len(fit.plot(show="residual")) == 3
+    assert len(fit.plot(show="residual")) == 4
     plt.close("all")
 
 

@@ -78,7 +78,7 @@ def test_a_trace_in_float32_is_refused_with_the_line_to_add(transform):
 
     study = Scene((), (Trial("c", ResistorLoad(98.8e3)),), sample_rate=RATE, samples=2000)
     driver = etid.identify_driver(
-        study.simulate(seed=1)["c"], order=2, method="equation_error", throw=False
+        study.simulate(seed=1)["c"], order=2, method="steiglitz_mcbride", throw=False
     )
     with (
         jax.enable_x64(False),

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import etid
+from benchmarks.spice import imported
 from etid.identify.planning import explained
 from etid.recordings.causes import why_misaligned
 from etid.recordings.preflight import Inspected
@@ -46,6 +46,7 @@ def test_coarse_converters_and_every_rate_pass(bits, sample_rate):
         assert preflight(one.replace(adc_range=None)) is None
 
 
+@settings(max_examples=15)
 @given(
     load=st.one_of(
         st.builds(SkinLoad, st.floats(1e3, 1e5), st.floats(1e4, 1e6), st.floats(30e-12, 2e-9)),
@@ -60,12 +61,11 @@ def test_any_load_passes(load, jitter, snr_db, seed):
     assert preflight(simulate(load, seed, snr_db=snr_db, trigger_jitter_rms=jitter)) is None
 
 
-def test_reference_recordings_pass_but_the_clipped_ones(reference_data, tmp_path):
+def test_reference_recordings_pass_but_the_clipped_ones(reference_data):
     folder = reference_data("spice_recordings")
     refused = {}
     for name in json.loads((folder / "truth.json").read_text())["scenes"]:
-        etid.import_file(folder / f"{name}.npz", tmp_path / f"{name}.h5")
-        with etid.read(tmp_path / f"{name}.h5") as study:
+        with imported(folder / f"{name}.npz") as study:
             names = {preflight(study[path]) for path in study} - {None}
         if names:
             refused[name] = names

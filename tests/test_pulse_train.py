@@ -49,8 +49,14 @@ def noisy(request):
     return simulate(request.param, 6.0, snr_db=20.0)
 
 
-@pytest.mark.parametrize("periods", [1.5, 2.0, 6.0])
-@pytest.mark.parametrize("factor", [1 / 3, 0.5, 0.99, 1.01, 2.0, 3.0, 40.0, 60.0, 1000.0])
+@pytest.mark.parametrize(
+    ("periods", "factor"),
+    [
+        *((1.5, factor) for factor in (1 / 3, 0.99, 2.0, 40.0)),
+        *((2.0, factor) for factor in (0.5, 1.01, 3.0, 1000.0)),
+        *((6.0, factor) for factor in (1 / 3, 0.5, 0.99, 2.0, 60.0)),
+    ],
+)
 def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
     """Half and double distances are no way out; from 1.5 periods on two pulses are there."""
     rate, size = noisy.sample_rate, int(periods * noisy.sample_rate / PULSE) + 1
@@ -86,7 +92,7 @@ def test_two_records_with_different_clocks_are_a_mismatch(sample_rate, ppm, snr_
         assert said in explained(record, "rate_mismatch")
 
 
-@pytest.mark.parametrize("sample_rate", [20e3, 50e3, 100e3, 200e3, 1e6])
+@pytest.mark.parametrize("sample_rate", [20e3, 100e3, 1e6])
 @pytest.mark.parametrize("before", [10e-6, 20e-6, 40e-6, 60e-6])
 def test_a_record_that_begins_close_to_an_edge_has_one_clock(sample_rate, before):
     record = simulate(sample_rate, snr_db=60.0, start=1.2e-4 - before)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import etid
+import etid.display
 from etid.circuits.impedance import realise
 from etid.identify.options import Options
 from etid.plotting import figure_of
@@ -40,7 +41,7 @@ etid.identify_skins([], of.driver) -> no recording
 etid.identify_study(etid.Study.from_recordings([of.calibration])) -> no loaded recording
 etid.identify_skin(of.skin, of.discrete) -> no continuous source
 etid.identify_skin(faster(of.skin), of.driver, method='steiglitz_mcbride') -> the same sample rate
-etid.identify_skin(of.skin, of.driver, circuit=etid.Resistor(), method='equation_error')
+etid.identify_skin(of.skin, of.driver, circuit=etid.Resistor(), method='steiglitz_mcbride')
     -> identifies SkinRC only
 etid.predict(of.skin, of.driver) -> give the circuit
 skin(of, method='steiglitz_mcbride') -> steiglitz_mcbride.*from a measured current
@@ -52,6 +53,8 @@ samples(of, method=WITH_CURRENT) -> arrays have no current
 skin(of, fixed={'r_x': 1.0}) -> 'r_x' is no element of SkinRC; its elements are r_s, r_p, c_p
 skin(of, fixed={'r_s': -1.0}) -> must be positive
 skin(of, prior={'r_s': (500.0, 50.0)}, fixed={'r_s': 500.0}) -> r_s is fixed and has a prior
+skin(of, circuit='R0-p(R1,CPE1)', fixed={'alpha_1': 2.0}) -> alpha_1 is 2; an exponent is at most 1
+skin(of, circuit='R0-p(R1,CPE1)', prior={'alpha_1': (2.0, 0.1)}) -> an exponent is at most 1
 etid.identify_skin(of.alone, circuit='auto', fixed={'r_s': 33000.0})
     -> r_s is known, but ParallelRC and Resistor have no
 etid.select_circuit(of.alone, fixed={'r_s': 33000.0})
@@ -65,12 +68,11 @@ skin(of, bounds={'r_s': (1.0, 1000.0)}, fixed={'r_s': 5.0}) -> r_s is fixed and 
 skin(of, bounds={'r_s': (1.0, 1000.0)}, method='steiglitz_mcbride')
     -> 'steiglitz_mcbride' takes no known elements and no bounds
 of.impedance.budget() -> a measured impedance has no budget
-of.impedance.plot(show='residual') -> no residual in time
 etid.Instrument(gain=-1e-3) -> gain
 etid.Instrument(capacitance=5.0) -> \[F\]
 etid.Instrument(r_load=5.0) -> relative
 etid.Instrument(c_load=5.0) -> \[F\]
-etid.identify_driver(of.calibration, instrument=GAIN, method='equation_error') -> equation_error
+etid.identify_driver(of.calibration, instrument=GAIN, method='steiglitz_mcbride') -> gives none
 etid.identify_driver(of.calibration, method='steiglitz_mcbride(steps=3)') -> has no such options
 etid.identify_driver(of.calibration, method='steiglitz_mcbride(iterations=0)')
     -> has no such options
@@ -88,6 +90,7 @@ etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 0.0, 3.0]) -> impedance is 0
 dataclasses.replace(of.fit, method='output_error').posterior(of.skin, of.driver)
     -> the method maximum_likelihood
 of.fit.profile('cp') -> 'cp' is no element of SkinRC
+dataclasses.replace(of.fit).profile('c_p') -> in fit\.profile\(recording, driver\)
 of.fit.posterior(draws=0) -> at least 1
 of.batch.posterior(of.skin, of.driver) -> take one of them
 dataclasses.replace(of.fit, cov=np.full((3, 3), np.nan)).posterior(of.skin, of.driver)
@@ -111,8 +114,8 @@ of.tracker.update(of.state, np.zeros((2, 3334))) -> shape \(2, 3334\).* \(2, 333
 of.tracker.update(of.state, of.window, -1.0) -> finite and not negative
 of.tracker.update(of.state, of.window, np.nan) -> finite and not negative
 of.tracker.update(of.state, of.window, np.ones(3)) -> shape \(3,\)
-etid.Tracker.of(of.driver, of.calibration, electrodes=0) -> electrodes is 0
-etid.Tracker.of(of.driver, of.calibration, electrodes=1, change=-1.0) -> change is -1
+etid.display.Tracker.of(of.driver, of.calibration, electrodes=0) -> electrodes is 0
+etid.display.Tracker.of(of.driver, of.calibration, electrodes=1, change=-1.0) -> change is -1
 tracker(of, driver=pictures.as_kind(of.driver, ContinuousDriver)) -> harmonics
 of.tracker.update(of_others(of), of.window) -> 1 electrode of 3 elements, the tracker 2 of 3
 of.tracker.read(of_others(of)) -> 1 electrode of 3 elements, the tracker 2 of 3
@@ -127,7 +130,7 @@ limited(of, current_cap=5.0) -> ampere
 limited(of, current_cap=np.inf) -> ampere
 limited(of, charge_cap=200.0) -> never act
 limited(of, fallback=np.inf) -> infinite
-etid.Controller.of(dataclasses.replace(of.tracker, driver_result=verdict('misfit')))
+etid.display.Controller.of(dataclasses.replace(of.tracker, driver_result=verdict('misfit')))
     -> driver of the tracker cannot be used
 of.controller.command(of.state) -> either charge or current
 of.controller.command(of.state, charge=-1e-09) -> finite and not negative
@@ -138,7 +141,7 @@ of.controller.command(of.state, current=np.array([0.0001, 0.006])) -> is wanted;
 etid.identify_study(of.study, order=1) -> order: is 1, must be
 etid.identify_jointly(of.study, order=21) -> order: is 21, must be
 etid.fit_file('absent.h5', 'fits.h5', order=1) -> order: is 1, must be
-etid.identify_study(of.study, order='auto', method='equation_error')
+etid.identify_study(of.study, order='auto', method='steiglitz_mcbride')
     -> needs maximum likelihood
 etid.identify_driver(of.calibration, plausible=(3e5, 3e2)) -> plausible: is \(300000\.0, 300\.0\),
 etid.identify_study(of.study, plausible=(-1.0, 3e2)) -> plausible: is \(\-1\.0, 300\.0\), must be
@@ -147,10 +150,10 @@ etid.fit_file('absent.h5', 'fits.h5', plausible=(1.0, 1.0)) -> plausible: is \(1
 etid.Instrument(drift=1.0) -> drift .* is 1\.0; it is a standard deviation \[relative\], at least
 etid.Instrument(delay=1.0) -> delay .* is 1\.0; it is a standard deviation \[s\], above 0
 etid.Instrument(delay=0.0) -> delay .* is 0\.0; it is a standard deviation \[s\], above 0
-etid.identify_study(of.study, method='equation_error', instrument=GAIN) -> gives none
+etid.identify_study(of.study, method='steiglitz_mcbride', instrument=GAIN) -> gives none
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=-0.1)) -> r_load .* is \-0\.1; it
 etid.identify_jointly(of.study, instrument=etid.Instrument(r_load=np.nan)) -> r_load .* is nan; it
-etid.identify_study(of.study, method='equation_error', fixed={'r_s': 1.0}) -> no known elements
+etid.identify_study(of.study, method='steiglitz_mcbride', fixed={'r_s': 1.0}) -> no known elements
 etid.identify_study(of.study, circuit='R0-p(R1') -> 'R0\-p\(R1' is no circuit: it ends too early
 etid.identify_skin(of.skin, circuit='R0-R0') -> has R0 twice
 etid.identify_skins([of.skin], circuit='SkinRC')
@@ -163,7 +166,7 @@ etid.identify_driver(of.calibration.replace(v_th=np.zeros(10_000))) -> flat
 etid.identify_driver(of.calibration.replace(v_out=of.calibration.v_th)) -> unconnected
 etid.identify_skin(of.both.replace(current=1000.0 * of.both.current), of.driver)
     -> current .* A, .* ohm
-etid.Tracker.of(of.driver, cut(of.calibration, 1500), electrodes=1) -> not_periodic
+etid.display.Tracker.of(of.driver, cut(of.calibration, 1500), electrodes=1) -> not_periodic
 [Exception]
 etid.identify_driver(of.calibration, method=GUESS) -> guess
 etid.identify_skin(of.skin, of.driver, method=GUESS) -> guess
@@ -199,7 +202,7 @@ def of():
     study = Scene(trials, known, current_snr_db=40.0).simulate(seed=2)
     both, calibration = study["loaded/0"], study["calibration/0"]
     driver = etid.identify_driver(calibration, order=5)
-    tracker = etid.Tracker.of(driver, calibration, electrodes=2)
+    tracker = etid.display.Tracker.of(driver, calibration, electrodes=2)
     made = jax.tree.map(np.asarray, pictures.fit())
     alone, frequency = both.without_v_th(), np.geomspace(60.0, 1e5, 20)
     z = np.asarray(pictures.SKIN.response(jnp.asarray(frequency)))
@@ -213,11 +216,11 @@ def of():
         impedance=etid.identify_impedance(frequency, z),
         driver=driver,
         tolerant=etid.identify_driver(calibration, instrument=GAIN),
-        discrete=etid.identify_driver(calibration, method="equation_error", throw=False),
+        discrete=etid.identify_driver(calibration, method="steiglitz_mcbride", throw=False),
         fit=etid.identify_skin(both.replace(current=None), driver),
         tracker=tracker,
         state=tracker.start(),
-        controller=etid.Controller.of(tracker),
+        controller=etid.display.Controller.of(tracker),
         window=np.zeros((2, tracker.model.bands.samples)),
         batch=jax.tree.map(lambda *leaves: np.stack(leaves), made, made),
     )
@@ -252,7 +255,7 @@ def samples(of, **options):
 
 
 def tracker(of, driver):
-    return etid.Tracker.of(driver, of.calibration, electrodes=1)
+    return etid.display.Tracker.of(driver, of.calibration, electrodes=1)
 
 
 def of_others(of):
@@ -262,7 +265,7 @@ def of_others(of):
 
 
 def limited(of, **limits):
-    return etid.Controller.of(of.tracker, **limits)
+    return etid.display.Controller.of(of.tracker, **limits)
 
 
 USED = cut, faster, skin, samples, tracker, of_others, limited, Twice

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.paper import demo, tables
+from benchmarks.paper import demo, tables
 from tests import pictures, printed
 
 EXCESS = 1.1  # of every identified element over the true one

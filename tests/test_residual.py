@@ -163,11 +163,12 @@ def test_periods_of_noise_differ_by_it():
 def test_neighbours_of_an_impedance(spectrum):
     f, z, stderr = spectrum
     for error in (None, stderr):
-        good = etid.identify_impedance(f, z, stderr=error, circuit=etid.SkinCole()).residual()
+        fit = etid.identify_impedance(f, z, stderr=error, circuit=etid.SkinCole())
+        good = fit.residual()
         bad = etid.identify_impedance(f, z, stderr=error, throw=False).residual()
         assert good.is_noise
         assert not bad.is_noise
-        assert len(good.plot()) == 2
+        assert len(good.plot()) == len(fit.plot(show="residual")) == 2
     assert bad.rms > 3 > good.rms
 
 

@@ -17,13 +17,14 @@ MADE_BY = {  # tables whose names are not those of their benchmarks
 }
 # No number of a benchmark depends on them.
 SHOWN = (
-    *("cli.py", "commands", "files", "garbage.py", "live", "paper", "plotting", "report"),
+    *("cli.py", "commands", "files", "garbage.py", "live", "plotting", "report"),
     *("results/variation.py", "simulation/calibration.py"),
+    *(f"display/{name}" for name in ("command.py", "page.html", "server.py", "view.py")),
 )
 # Tables whose numbers depend on them; those of no other do.
 ONLY = {
     ("identify/jointly.py", "selection/delays.py", "likelihood/joint"): ("coverage", "tolerances"),
-    ("online",): ("control", "live", "mutation", "online"),
+    ("online", "display"): ("control", "live", "mutation", "online"),
 }
 
 
@@ -83,7 +84,7 @@ def test_a_result_is_of_this_code(table):
     ]
     of = ["etid", ":!*.pyi", *(f":!etid/{name}" for name in without)]
     for one in commits(table):
-        changed = git("diff", "--name-only", one, "HEAD", "--", *of).stdout.split()
+        changed = git("diff", "--name-only", "--no-renames", one, "HEAD", "--", *of).stdout.split()
         before, now = code(one, changed), code("HEAD", changed)
         for statement in before.keys() - now.keys():
             command = MADE_BY.get(table.stem, table.stem)

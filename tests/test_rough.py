@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from etid.paper import rough
+from benchmarks.paper import rough
 from etid.simulation.falling import FallingResistance
 from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Trial

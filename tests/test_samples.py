@@ -60,7 +60,7 @@ def transformed(how, records, driver):
     return [jnp.stack(of) for of in zip(*each, strict=True)]
 
 
-@pytest.mark.parametrize("how", ["jit", "vmap"])
+@pytest.mark.parametrize("how", [pytest.param("jit", marks=pytest.mark.slow), "vmap"])
 def test_transformed_fits_are_those_of_numpy(how, records, driver, in_numpy):
     """Those of `jit` also compute by JAX what the calibrations tell of the driver."""
     values, errors, cov, chi2, result, points = in_numpy

@@ -37,7 +37,7 @@ def records():
 def test_the_period_after_which_a_sample_is_missing_or_too_many_is_found(
     records, load, which, fault
 ):
-    for period in range(1, 5):
+    for period in (1, 4):
         one = faulty(records[load], fault, round((period - 0.3) * PERIOD), which)
         seen = Inspected.of(one)
         assert seen.shifts is not None

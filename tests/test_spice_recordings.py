@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import etid
+from benchmarks.spice import mapping_of
 from etid.estimators.registry import Method
 
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
@@ -32,7 +33,8 @@ def spice(reference_data, tmp_path_factory):
     def fitted(name, method: Method | None = None):
         file = work / f"{name}.h5"
         if not file.exists():
-            etid.import_file(folder / f"{name}.npz", file)
+            source = folder / f"{name}.npz"
+            etid.import_file(source, file, mapping_of(source))
         trials = [trial["elements"] for trial in truth[name]["trials"]]
         circuit = etid.Resistor() if "R" in trials[0] else etid.SkinRC()
         with etid.read(file) as study:

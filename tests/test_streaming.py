@@ -23,7 +23,8 @@ from etid.results.study_fits import StudyFits
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
-METHOD = "equation_error"  # what is tested is the parts, not the fits, and it compiles fastest
+# What is tested is the parts, not the fits, and it compiles fastest.
+METHOD = "steiglitz_mcbride(iterations=1)"
 PART = 4
 COUNT = 14  # three whole parts and a half
 

@@ -26,7 +26,7 @@ def model_of(y, s, drivers):
     columns = SUBJECT.astype(str), SESSION.astype(str)
     levels = _levels(columns, ("subject", "session"), y.size)
     assert list(levels) == ["subject", "session", REST]
-    return _Model.of(y, s, list(levels.values()), drivers)
+    return _Model(y, s, list(levels.values()), drivers)
 
 
 def test_the_restricted_likelihood_is_that_of_all_contrasts():
@@ -48,7 +48,7 @@ def test_the_restricted_likelihood_is_that_of_all_contrasts():
         return np.linalg.slogdet(v)[1] + rest @ np.linalg.solve(v, rest)
 
     for other in others:
-        ours = model.deviance(np.array(other)) - model.deviance(np.array(first))
+        ours = model.at(np.array(other))[0] - model.at(np.array(first))[0]
         assert ours == pytest.approx(deviance(other) - deviance(first), rel=1e-6)
 
 
@@ -90,8 +90,8 @@ def test_an_interval_has_95_per_cent():
     best = np.sqrt(squares / free)
     least = free * np.log(best**2) + free
     expected = [scipy.optimize.brentq(beyond, *of) for of in ((0.1, best), (best, 10.0))]
-    model = _Model.of(y, np.zeros(y.size), [np.arange(y.size)], np.zeros((y.size, 0)))
-    found, _, _ = model.fitted()
+    model = _Model(y, np.zeros(y.size), [np.arange(y.size)], np.zeros((y.size, 0)))
+    found = model.best()
     # The search ends within 1e-5 of the deviance, its root within 1e-4; 90 % would be 8 % narrower.
     assert found[0] == pytest.approx(best, rel=2e-3)
     np.testing.assert_allclose(model.interval(0, found), expected, rtol=1e-3)
@@ -111,7 +111,7 @@ def test_errors_of_drivers_are_no_variation_between_the_sessions_that_share_them
         y = drawn(seed, truth, s) + drivers @ errors
         for told in held:
             model = model_of(y, s, told * drivers)
-            low, high = model.interval(1, model.fitted()[0])
+            low, high = model.interval(1, model.best())
             held[told] += low <= truth[1] <= high
     assert held[True] >= 25
     assert held[False] < 25  # drivers of their own must be told

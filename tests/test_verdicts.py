@@ -70,9 +70,8 @@ def test_samples_that_are_broken(study, driver, change, verdict):
 
 def test_insensitive(driver):
     """A resistor has no R_p and no C_p to find."""
-    for seed in range(3):
-        resistor = simulate(ResistorLoad(328.9e3), seed=seed)["loaded/0"]
-        assert verdict_of(resistor, driver) == "insensitive"
+    resistor = simulate(ResistorLoad(328.9e3))["loaded/0"]
+    assert verdict_of(resistor, driver) == "insensitive"
 
 
 def test_misfit(driver):
@@ -91,7 +90,7 @@ def test_nonphysical_and_driver_failed(study):
     v = calibration.v_out * np.std(calibration.v_th) / np.std(calibration.v_out)
     more = calibration.replace(v_out=1.004 * v, adc_range=None)
     with pytest.raises(etid.IdentificationError, match="driver: nonphysical") as raised:
-        etid.identify_driver(more)
+        etid.identify_driver(more, order=3)
     driver = raised.value.outcome
     assert isinstance(driver, etid.Driver)
     assert driver.verdict == "nonphysical"
@@ -119,7 +118,7 @@ def test_the_papers_method_says_how_it_fails():
             of["calibration/98k8"], method="steiglitz_mcbride", throw=False
         )
         found.add(driver.verdict)
-        for method in ("steiglitz_mcbride", "equation_error"):
+        for method in ("steiglitz_mcbride", etid.SteiglitzMcBride(iterations=1)):
             found.add(verdict_of(of["loaded/0"], driver, method=method))
     assert found >= {"max_steps_reached", "unstable", "biased", "misfit"}
     assert "successful" not in found
@@ -139,13 +138,14 @@ def test_a_test_produces_every_verdict_of_etid():
     """Expected of a real fit: what is only given to a result made by hand does not count."""
     own = set(vars(RESULTS)["_name_to_item"]) - set(vars(optx.RESULTS)["_name_to_item"])
     expected = set()
-    for path in pathlib.Path(__file__).parent.glob("test_*.py"):
+    for path in pathlib.Path(__file__).parent.rglob("test_*.py"):
         text = path.read_text("utf-8")
         if re.search(r"identify_|preflight\(|Tracker|fit_file\(", text):
             expected |= _texts(ast.parse(text))
     # The name alone, or before the text of the verdict.
-    forms = [re.compile(rf"(^|\W){name}($|[\\.:])") for name in sorted(own)]
-    assert [form.pattern for form in forms if not any(map(form.search, expected))] == []
+    every = "\n".join(expected)
+    forms = [re.compile(rf"(^|\W){name}($|[\\.:])", re.MULTILINE) for name in sorted(own)]
+    assert [form.pattern for form in forms if not form.search(every)] == []
 
 
 def _texts(tree):

@@ -21,19 +21,20 @@ def commands():
     """The commands of the page that are not Python, in their order."""
     fence = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
     blocks = [text for language, text in fence.findall(PAGE.read_text("utf-8")) if not language]
-    lines = "".join(blocks).replace("\\\n", " ").splitlines()
+    lines = "".join(blocks).replace("\\\n", " ").replace("E{1..98}", "E1 E2").splitlines()
     return [shlex.split(line, comments=True) for line in lines if line.startswith("etid ")]
 
 
 def write(path, loads, seed, periods=3.1):
-    """A file as the page describes it: the voltages, and the number of the electrode."""
+    """A file as the page describes it: the voltages, and a trigger for each electrode."""
     size = round(periods * RATE / 60)
     trials = tuple(Trial(f"{number}", load) for number, load in loads.items())
     scene = Scene(trials, sample_rate=RATE, samples=size, snr_db=50.0, start=0.75 / 60)
     study = scene.simulate(seed)
     both = [(study[f"{number}"].v_th, study[f"{number}"].v_out) for number in loads]
     v_th, v_out = SCALE * np.concatenate(both, axis=1)
-    table = np.column_stack([v_th, v_out, np.repeat([*loads], size)])
+    trigger = np.tile(np.arange(size) == 100, len(loads))  # a pulse comes after 833 samples
+    table = np.column_stack([v_th, v_out, trigger])
     np.savetxt(path, table, "%.6g,%.6g,%d", ",", header="CH1,CH2,CH3", comments="")
 
 

@@ -136,13 +136,13 @@ def run(
     name: str,
     problem: Mapping[str, Any],
     repeats: int,
-    timeout: float,
+    timeout: float | None,
     budget: float = math.inf,
     python: pathlib.Path | None = None,
 ) -> Outcome:
     """Run a rival on a problem, on one core, in a process of its own.
 
-    After the `budget` [s] no further draw is begun; the `timeout` [s] is that of all of it.
+    After the `budget` [s] no further draw is begun; the `timeout` [s] is that of all, if any.
     """
     rival = RIVALS[name]
     if python is None and not installed(rival.environment):

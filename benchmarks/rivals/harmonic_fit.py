@@ -18,18 +18,16 @@ RESONANCE, SLOW, OTHERS = 50e3, 30.0, (5e3, 20e3, 150e3)
 
 
 def driver(fit, v_th, v_out, r_load, fs, f0):
-    """Parameters of `source_impedance`, and R_L [ohm]."""
+    """Z_th at the harmonics of a calibration [ohm], by the best of several starts."""
     of = harmonics(v_th, v_out, fs, f0)
     found = [fit(driver_misfit, start, of)[0] for start in driver_starts(of)]
     misfits = [np.sum(driver_misfit(q, *of) ** 2) for q in found]
-    return found[int(np.nanargmin(misfits))], r_load
+    return r_load * source_impedance(found[int(np.nanargmin(misfits))], of.f)
 
 
-def skin(fit, v_th, v_out, model, start, fs, f0):
+def skin(fit, v_th, v_out, z_th, start, fs, f0):
     """Elements [ohm, ohm, F], and whether the package calls them a success."""
-    parameters, r_load = model
     of = harmonics(v_th, v_out, fs, f0)
-    z_th = r_load * source_impedance(parameters, of.f)
     q, ok = fit(skin_misfit, np.append(np.log(start), 0.0), (*of, z_th))
     return np.exp(q[:3]), ok
 

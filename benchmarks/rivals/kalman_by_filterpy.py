@@ -1,9 +1,9 @@
 """filterpy's extended Kalman filter with etid's model: `python -m ... PROBLEM RESULT`.
 
-The model is that of `etid.Tracker`, with derivatives in closed form, and one filter for each
-electrode. It is told the sampling phase of each pulse and the gains of the bands, and has no tests
-for changes. PROBLEM holds gains and their variances (pulse, lane, band), delays [samples] of the
-pulses, the bands, the standard deviation of the random walk, and logarithms of the elements to
+The model is that of `etid.display.Tracker`, with derivatives in closed form, and one filter for
+each electrode. It is told the sampling phase of each pulse and the gains of the bands, and has no
+tests for changes. PROBLEM holds gains and their variances (pulse, lane, band), delays [samples] of
+the pulses, the bands, the standard deviation of the random walk, and logarithms of the elements to
 start from. RESULT gets the processor time of each pulse and the last logarithms.
 """
 

@@ -17,6 +17,8 @@ class Rival(NamedTuple):
     package: str  # whose version is shown
     setting: str  # how it is set, in a line
     works: str = EXACT  # a scene in which it should work, of `SCENES`
+    # whether it minimises the residuals of `harmonic_fit`: what etid reaches, it should reach
+    strong: bool = False
     # of `.rivals/`, made from the requirements of that name beside this file
     environment: str = "common"
     program: Mapping[str, str] = {}  # what must be on the path besides, by its Debian packages
@@ -40,10 +42,10 @@ _NARX = "linear, first order, free run, from current to voltage, 1 MHz; no delay
 _NO_PENALTY = f"{_STATE}, L-BFGS without penalties; no delay"
 
 RIVALS: Mapping[str, Rival] = {  # by module, and by estimator where it has several
-    "scipy_harmonics": Rival("SciPy least_squares, harmonics", "scipy", _MINPACK, LATE),
-    "lmfit_leastsq": Rival("lmfit leastsq", "lmfit", "the same residuals", LATE),
-    "optimistix_lm": Rival("optimistix LM", "optimistix", f"{_SAME}, tolerances 1e-8", LATE),
-    "jaxopt_lm": Rival("jaxopt LM", "jaxopt", f"{_SAME}, Cholesky, tolerances 1e-8", LATE),
+    "scipy_harmonics": Rival("SciPy least_squares, harmonics", "scipy", _MINPACK, LATE, True),
+    "lmfit_leastsq": Rival("lmfit leastsq", "lmfit", "the same residuals", LATE, True),
+    "optimistix_lm": Rival("optimistix LM", "optimistix", f"{_SAME}, tolerances 1e-8", LATE, True),
+    "jaxopt_lm": Rival("jaxopt LM", "jaxopt", f"{_SAME}, Cholesky, tolerances 1e-8", LATE, True),
     "scipy_lfilter": Rival(
         "SciPy least_squares, lfilter", "scipy", f"{_PERIOD}, Tustin, a delay of V_th"
     ),

@@ -2,7 +2,8 @@
 
 PROBLEM is that of `rivals.run`; its `name` is a module beside this, run by the Python of its own
 environment, which has `skin` for one record and Z_th as measured, or `fit` for the residuals of
-`harmonic_fit`, or `batch` of an estimator for all of a problem at once. After the `budget` [s] no
+`harmonic_fit`, or `batch` of an estimator for all of a problem at once. If the problem has `z_th`,
+at the harmonics of each draw, no driver is fitted. After the `budget` [s] no
 further draw is begun, but for the second; a first fit that took as long is the only one. RESULT
 gets the fields of `rivals.Outcome`, `versions` and `errors` as JSON.
 """
@@ -50,8 +51,9 @@ def results(rival, problem, repeats, budget):
         try:
             reference = problem["ref_th"][i], problem["ref_out"][i], float(problem["r_ref"][i])
             begin = time.perf_counter()
-            model = driver(*reference, fs, f0)
-            found["driver_seconds"][i] = time.perf_counter() - begin
+            known = "z_th" in problem
+            model = problem["z_th"][i] if known else driver(*reference, fs, f0)
+            found["driver_seconds"][i] = np.nan if known else time.perf_counter() - begin
             arguments = (problem["v_th"][i], problem["v_out"][i], model, start, fs, f0)
             runs = []
             if np.isnan(found["first_seconds"]):

@@ -1,7 +1,8 @@
 """Parts of pages that are made from the code: `<!-- made: NAME -->` in a page.
 
 The tables of verdicts and remarks come from their messages, the tests from the table of directions,
-the command line from its parsers, and the reference from the names that `etid` exports.
+the command line from its parsers, and the reference from the names that `etid` and `etid.display`
+export.
 """
 
 import os
@@ -12,8 +13,11 @@ import types
 import optimistix as optx
 
 import etid
+import etid.display
 from etid import cli
 from etid.circuits import directions
+from etid.display.__main__ import PROGRAM
+from etid.display.__main__ import parser as parser_of_display
 from etid.recordings import remarks
 from etid.results import verdicts
 
@@ -60,7 +64,7 @@ def table_of_tests():
 
 PROGRAMS = (
     "waveform", "design", "own_circuit", "own_solver", "own_prior", "profile", "hierarchy",
-    "batches", "correct_driver", "pulse", "any_record",
+    "variation", "batches", "correct_driver", "pulse", "any_record", "export_nwb",
 )  # fmt: skip
 
 
@@ -83,6 +87,7 @@ def commands():
     for action in parser._actions:
         if isinstance(action.choices, dict):
             helps |= {f"etid {name}": one.format_help() for name, one in action.choices.items()}
+    helps[PROGRAM] = parser_of_display().format_help()
     return "\n\n".join(f"### {name}\n\n```text\n{text}```" for name, text in helps.items())
 
 
@@ -93,14 +98,13 @@ TASKS = {
     "Use the results": ("results",),
     "Show and share": ("plotting", "report"),
     "Simulate and plan": ("simulation",),
-    "Follow a display": ("online",),
     "Circuits": ("circuits",),
     "Methods": ("estimators",),
 }
 
 
 def reference():
-    """Reference of all names that `etid` exports, by task."""
+    """Reference of all names that `etid` exports, by task, and of those of `etid.display`."""
     names = sorted(set(etid.__all__) - {"__version__"}, key=str.lower)
     of = {name: _package(getattr(etid, name)) for name in names}
     missing = {name for name, package in of.items() if package not in sum(TASKS.values(), ())}
@@ -109,6 +113,8 @@ def reference():
     for heading, packages in TASKS.items():
         parts.append(f"## {heading}")
         parts += [f"::: etid.{name}" for name, package in of.items() if package in packages]
+    parts.append("## Follow a display: `import etid.display`")
+    parts += [f"::: etid.display.{name}" for name in etid.display.__all__]
     return "\n\n".join(parts)
 
 

@@ -5,7 +5,6 @@ Formulas and parameters are those of impedance.py 1.7, so that fits of both agre
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,14 +85,16 @@ class AbstractLayer(AbstractIrrational):
         first: x_k = (first + k)² π², k = 0, 1, …, are the frequencies of the relaxations, times τ.
         total: Sum of their resistances 2 R / x_k, relative to R.
         least: s τ that stands for 0.
+        r: R [Ω].
+        tau: τ [s].
     """
 
     sign: ClassVar[float]
     first: ClassVar[float]
     total: ClassVar[float]
     least: ClassVar[float]
-    r: eqx.AbstractVar[Ohm]
-    tau: eqx.AbstractVar[Second]
+    r: Ohm
+    tau: Second
 
     def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
@@ -168,8 +169,6 @@ class Diffusion(AbstractLayer):
     first: ClassVar[float] = 0.5
     total: ClassVar[float] = 1.0
     least: ClassVar[float] = 1e-10  # the limit is R
-    r: Ohm
-    tau: Second
 
 
 class FiniteSpace(AbstractLayer):
@@ -185,8 +184,6 @@ class FiniteSpace(AbstractLayer):
     first: ClassVar[float] = 1.0
     total: ClassVar[float] = 1 / 3
     least: ClassVar[float] = 0.0
-    r: Ohm
-    tau: Second
 
     def state_space(self, rate: float | Float[AnyArray, ""], samples: int) -> StateSpace:
         """Its relaxations and the capacitor."""

@@ -21,7 +21,6 @@ import operator
 from functools import reduce
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float, Inexact
@@ -237,7 +236,7 @@ class AbstractConnection(AbstractImpedance):
         parts: The impedances, at least one.
     """
 
-    parts: eqx.AbstractVar[tuple[AbstractImpedance, ...]]
+    parts: tuple[AbstractImpedance, ...]
 
     def __check_init__(self) -> None:
         if not self.parts:
@@ -252,8 +251,6 @@ class AbstractConnection(AbstractImpedance):
 
 class Series(AbstractConnection):
     """A series connection, Z = Z₁ + Z₂ + …."""
-
-    parts: tuple[AbstractImpedance, ...]
 
     def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""
@@ -286,8 +283,6 @@ class Series(AbstractConnection):
 
 class Parallel(AbstractConnection):
     """A parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + …."""
-
-    parts: tuple[AbstractImpedance, ...]
 
     def __call__(self, s: Complex[AnyArray, "..."]) -> Complex[AnyArray, "..."]:
         """Impedance [Ω]."""

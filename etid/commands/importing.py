@@ -81,7 +81,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             # A resistance may be a text such as 98k8.
             kind = float if field.type == "number" and field.unit != "ohm" else str
             shape = "OHM" if field.unit == "ohm" else ""
-            _option(parser, name, kind, f"{field.description.rstrip('.')}{unit}", shape)
+            what, count = f"{field.description.rstrip('.')}{unit}", None
+            if name == "electrode":
+                what, count = f"{what}; with --split also several, in the order they fire", "+"
+            _option(parser, name, kind, what, shape, count)
 
 
 def _option(
@@ -90,9 +93,11 @@ def _option(
     kind: Callable[[str], object] = str,
     help: str = "",
     metavar: str = "",
+    nargs: str | None = None,
 ) -> None:
     metavar = metavar or ("NUMBER" if kind in (int, float) else "NAME")
-    parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar=metavar, help=help)
+    option = f"--{name.replace('_', '-')}"
+    parser.add_argument(option, type=kind, nargs=nargs, metavar=metavar, help=help)
 
 
 def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
@@ -108,6 +113,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
         for name, value in vars(arguments).items()
         if name in (*CHANNELS, *FIELDS, *DIALECT)
     }
+    if arguments.electrode and len(arguments.electrode) == 1:
+        given["electrode"] = arguments.electrode[0]
     folder = os.path.isdir(arguments.source[0]) and arguments.mapping is None
     if folder or arguments.labels:
         return _folder(arguments, given)

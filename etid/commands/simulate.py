@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--stream",
         type=pathlib.Path,
         metavar="FILE",
-        help="also write pulses of a display with this skin, for etid live --file",
+        help="also write pulses of a display with this skin, for etid-live --file",
     )
 
 

@@ -7,6 +7,7 @@ of the fit. Standard errors contain it like any measurement. A fixed element has
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -80,6 +81,7 @@ def require_element(name: str, circuit: AbstractCircuit) -> None:
 
 def checked(known: Sequence[Sequence], circuit: AbstractCircuit) -> None:
     """Raise ValueError unless these are elements of the circuit with sensible values."""
+    usual, names = type(circuit)(), circuit.names()
     for one in known:
         name, mean, deviation = one
         require_element(name, circuit)
@@ -88,6 +90,11 @@ def checked(known: Sequence[Sequence], circuit: AbstractCircuit) -> None:
                 f"the known value of {name} is {mean:g} ± {deviation:g}; it must be positive, and "
                 "its standard deviation must not be negative"
             )
+        with jax.ensure_compile_time_eval():
+            told = usual.of_fit([mean if of == name else getattr(usual, of) for of in names])
+            steep = any(float(alpha) > 1 for alpha in told.exponents())
+        if steep:
+            raise ValueError(f"the known value of {name} is {mean:g}; an exponent is at most 1")
 
 
 def stated(known: Known) -> str:

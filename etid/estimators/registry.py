@@ -5,7 +5,7 @@ import dataclasses
 from etid.estimators.estimator import AbstractEstimator, Description
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.output_error import OutputError
-from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
+from etid.estimators.steiglitz_mcbride.estimator import SteiglitzMcBride
 from etid.results.method_options import options_of
 
 Method = str | AbstractEstimator  # a name in the registry, or an estimator with its options
@@ -27,12 +27,7 @@ def register(estimator: AbstractEstimator) -> None:
         raise ValueError(f"{estimator.name} is the name of {_ESTIMATORS[estimator.name]!r}")
 
 
-for _estimator in (
-    MAXIMUM_LIKELIHOOD,
-    OUTPUT_ERROR,
-    SteiglitzMcBride(),
-    EquationError(),
-):
+for _estimator in (MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, SteiglitzMcBride()):
     register(_estimator)
 
 

@@ -1,49 +1,16 @@
-"""Starts of the fits: impedance levels, simpler estimates, generic resonances."""
+"""Starts of Z_th: generic resonances, and that of a simpler estimate."""
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.precision import array_function, namespace
 from etid.results.driver import SourceImpedance
 from etid.signals.transfer import AnyArray, poles
 
-LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels of the starts of a circuit
 # Starts of Z_th: frequency, relative to the sample rate, and damping ratio of two sections.
 # `FAR` is that of all further sections.
 GENERIC = (((0.1, 0.3), (0.5, 1.5)), ((0.25, 0.3), (0.5, 1.5)), ((0.1, 0.3), (0.25, 0.3)))
 FAR = (0.5, 1.5)
-
-
-def circuit_starts(
-    circuit: AbstractCircuit, estimate: SkinRC | None
-) -> Float[Array, "start element"]:
-    """Starts of the elements' logarithms: several impedance levels, and last a simpler estimate.
-
-    Other circuits than SkinRC get the resistance at low frequency and the time constant of the
-    estimate. From typical values alone, a noisy recording can lead to a capacitor of 0.
-    """
-    typical = circuit.log_values()
-    level, time = circuit.scaling()
-    starts = [typical + float(np.log(factor)) * level for factor in LEVELS]
-    if estimate is None:
-        return jnp.stack(starts)
-    if isinstance(circuit, SkinRC):
-        found = estimate.values()
-        usable = jnp.all(found > 0) & jnp.isfinite(found).all()
-        starts.append(jnp.where(usable, jnp.log(jnp.where(usable, found, 1.0)), typical))
-    else:
-        usual, factors = _scales(SkinRC()), _scales(estimate)
-        usable = jnp.all(factors > 0) & jnp.isfinite(factors).all()
-        larger, slower = jnp.log(jnp.where(usable, factors / usual, 1.0))
-        starts.append(typical + larger * level + slower * time)
-    return jnp.stack(starts)
-
-
-def _scales(skin: SkinRC) -> Float[Array, "2"]:
-    """Resistance at low frequency [Ω] and time constant [s]."""
-    return jnp.stack([skin.r_s + skin.r_p, skin.r_p * skin.c_p])
 
 
 @array_function

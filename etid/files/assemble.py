@@ -17,7 +17,7 @@ from etid.files.clock import sample_rate
 from etid.files.mapping import KINDS, PAUSES, Plan, Signal
 from etid.recordings.fields import LABELS, SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, RecordingError
-from etid.recordings.splitting import firing, split
+from etid.recordings.splitting import split
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,13 +255,6 @@ def _parts(
     cause = channels["v_th"] if "v_th" in channels else channels["current"]
     more = None if by_pulses else samples(separating)
     order, rates = plan.electrodes, (common.sample_rate, common.pulse_rate)
-    if plan.numbered and more is not None:
-        parts, cut = split(samples(cause), *rates, which=more)
-        period = rates[0] / rates[1]
-        starts = np.array([part.start + round(period / 5) for part in parts])
-        numbers = firing(more, starts, period)
-        named = [order[0].replace(f"{{{plan.split}}}", str(number)) for number in numbers]
-        return parts, named, cut
     parts, cut = split(samples(cause), *rates, more, cut=not order)
     if order and len(parts) % len(order):
         raise RecordingError(

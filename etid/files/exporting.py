@@ -1,7 +1,6 @@
-"""Files for other programs: tables of fits, identified circuits, and recordings as NWB."""
+"""Files for other programs: tables of fits and identified circuits."""
 
 import csv
-import datetime
 import itertools
 import json
 import os
@@ -241,44 +240,3 @@ def _written(fit: Fit, path: str, suffix: str) -> str:
         "Fit": False,  # a fit of impedance.py would contain its own standard errors
     }
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-
-
-def export_study(
-    source: str | os.PathLike[str],
-    target: str | os.PathLike[str],
-    *,
-    session_start: datetime.datetime | None = None,
-) -> None:
-    """Write a file of recordings as NWB, one TimeSeries per record.
-
-    The group `acquisition` contains the TimeSeries. The record `v_out` of `s01/dry/0` becomes the
-    TimeSeries `s01.dry.0.v_out`. It has the stored samples, `conversion`, `offset`, `unit` and
-    `rate`. If several recordings share an unloaded record, it is stored once and linked. The table
-    `recordings` contains all other fields. It has one line per recording, with the names of its
-    TimeSeries. A file of recordings does not contain the start times of the recordings, so
-    `starting_time` is always 0.
-
-    One record at a time is in memory. The export needs the extra `nwb`.
-
-    Args:
-        source: File of recordings.
-        target: File to write, with the suffix `.nwb`. An existing file is replaced at the end.
-        session_start: Start of the session, with a time zone. NWB requires it, and a file of
-            recordings does not contain it.
-
-    Raises:
-        RecordingError: The source cannot be read, `session_start` is missing or has no time zone,
-            or pynwb is not installed.
-        ValueError: The target has another suffix than `.nwb`.
-    """
-    if pathlib.Path(target).suffix.lower() != ".nwb":
-        raise ValueError(f"{os.fspath(target)}: recordings are exported as .nwb")
-    if session_start is None or session_start.tzinfo is None:
-        raise RecordingError(
-            "is not given with a time zone, and is not guessed: NWB requires it",
-            file=os.fspath(source),
-            field="session_start",
-            remedy="Give the start of the session, such as 2026-01-31T09:30:00+01:00",
-        )
-    nwb = optional("etid.files.nwb", "nwb", os.fspath(target), "pynwb")
-    nwb.write_nwb(source, target, session_start)

@@ -24,9 +24,9 @@ from etid.files.mapping import (
     read_mapping,
     recordings_of,
 )
-from etid.files.readers import delimited, npz
+from etid.files.readers import delimited
 from etid.recordings.errors import require_file
-from etid.recordings.fields import DECLARED, LABELS, Metadata
+from etid.recordings.fields import DECLARED, Metadata
 from etid.recordings.recording import AbstractSource, RecordingError, check_rates
 from etid.recordings.study import Study, refuse_nested
 
@@ -42,10 +42,6 @@ def import_file(
     """Convert one or several files of other formats into one etid file.
 
     The suffix of a file gives its format; data_schema/README.md lists the formats.
-
-    If the arrays of a `.npz` file are those of `etid.files.readers.npz.own_mapping`, the file
-    contains all fields: only labels can be given, without `trial`, and the default condition is the
-    name of the file.
 
     With `split`, one long record becomes several trials: `"pulses"` splits it at the pauses between
     its pulses, the name of a trigger channel at the rising edges of the trigger. Files of
@@ -92,17 +88,6 @@ def import_file(
     known = resistors((calibrations or {}).items())
     paths = [*known, *(path for path in paths if path not in known)]  # loaded ones name the others
     given = {name: value for name, value in given.items() if value is not None}
-    complete = None
-    if len(paths) == 1 and paths[0].suffix.lower() == ".npz":
-        require_file(str(paths[0]))
-        with located(str(paths[0])):
-            complete = npz.own_mapping(paths[0])
-    if complete is not None:
-        labels = {name: given.pop(name) for name in LABELS if name in given and name != "trial"}
-        _refuse(given | ({} if mapping is None else {"mapping": mapping}), str(paths[0]),
-                "is not an argument for npz files, which contain it")  # fmt: skip
-        own = complete | {"condition": paths[0].stem} | labels
-        return converted({paths[0]: own}, target, by="file")
     if mapping is None:
         common = channels_of(given)
         turns = ("split", "electrode") if "split" in common else ()
@@ -171,7 +156,7 @@ def converted(
     target: str | os.PathLike[str],
     *,
     place: str = "",
-    by: Literal["command", "mapping", "file"] = "command",
+    by: Literal["command", "mapping"] = "command",
     root: pathlib.Path | None = None,
 ) -> list[Imported]:
     """Convert files, each with a mapping of its own, into one etid file.

@@ -51,10 +51,10 @@ class Plan:
         path: HDF5 path.
         signals: `v_out`, `v_th` or `current` or both, and `time` if the mapping names it.
         fields: All other keys of the mapping except `path`, `scale` and `split`.
-        split: `PAUSES`, or the channel of a trigger or of the number of the electrode, if trials
-            are parts of one long record; empty otherwise.
-        electrodes: Electrodes that fire in turn, in the order of the parts; or one name with the
-            channel of the number in braces, such as `E{which}`; empty if all parts are of one.
+        split: `PAUSES`, or the channel of a trigger, if trials are parts of one long record; empty
+            otherwise.
+        electrodes: Electrodes that fire in turn, in the order of the parts; empty if all parts are
+            of one.
     """
 
     path: str
@@ -62,11 +62,6 @@ class Plan:
     fields: Mapping[str, Any]
     split: str = ""
     electrodes: tuple[str, ...] = ()
-
-    @property
-    def numbered(self) -> bool:
-        """Whether the channel `split` has the number of the electrode."""
-        return any(f"{{{self.split}}}" in name for name in self.electrodes)
 
     @property
     def channels(self) -> set[str]:
@@ -256,23 +251,15 @@ def _plan(path: str, said: Mapping[str, Any], names: Sequence[str]) -> Plan:
 
 def _electrodes(said: Any, split: str) -> tuple[str, ...]:
     """The electrodes that fire in turn within one record; empty if it is of one electrode."""
-    several = isinstance(said, list)
-    numbered = isinstance(said, str) and re.search(r"\{(.*)\}", said)
-    if not several and not numbered:
+    if not isinstance(said, list):
         return ()
-    if numbered and (numbered[1] != split or split in ("", PAUSES)):
-        raise RecordingError(
-            f"is {said!r}, but the record is not split by a channel {numbered[1]!r}",
-            field="electrode",
-            remedy="Give split the channel of the number in braces, or leave out the braces",
-        )
-    if several and (not split or not said):
+    if not split or not said:
         raise RecordingError(
             f"is the list {said!r}: the electrodes of the parts of one long record, in turn",
             field="electrode",
             remedy=f"Give split too, {PAUSES!r} or the channel of a trigger",
         )
-    return tuple(DECLARED["electrode"].checked(one) for one in (said if several else [said]))
+    return tuple(DECLARED["electrode"].checked(one) for one in said)
 
 
 def _check_complete(said: Mapping[str, Any], names: Sequence[str]) -> None:

@@ -63,9 +63,9 @@ def identify_driver(
         order: Number of poles of Z_th (the paper uses 5), or `"auto"`: from 7 on as many as the
             calibrations need, by maximum likelihood, so that the standard errors contain poles that
             the calibrations do not show. `driver.tried` holds the evidence.
-        method: `"maximum_likelihood"`, the default; `"output_error"`, the paper's
-            `"steiglitz_mcbride"`, or its first iteration, `"equation_error"`. An estimator with
-            options is possible too, as in `etid.SteiglitzMcBride(iterations=5)`.
+        method: `"maximum_likelihood"`, the default; `"output_error"`, or the paper's
+            `"steiglitz_mcbride"`. An estimator with options is possible too, as in
+            `etid.SteiglitzMcBride(iterations=5)`.
         plausible: Smallest and largest |Z_th| [Ω] at 1 kHz that is accepted. The default range
             spans a factor of 1000: a driver within the range leaves it if `r_load` is given in kΩ.
         instrument: Tolerances of the instrument, as in `etid.Instrument(gain=1e-3)`. They enter the

@@ -106,8 +106,8 @@ class Likelihood(Overviewed, Module):
                 differences.
 
         Raises:
-            ValueError: The driver or the circuit cannot be used, or the records with a current hold
-                no two whole periods.
+            ValueError: The driver or the circuit cannot be used, a value is not finite, or the
+                records with a current hold no two whole periods.
         """
         if driver is None:
             feed = MEASURED_CURRENT
@@ -127,6 +127,13 @@ class Likelihood(Overviewed, Module):
             raise ValueError(
                 f"the records have the shapes {', '.join(map(str, sorted(shapes)))}; they must "
                 "have one, (…, time)"
+            )
+        for name, one in {"v_th": v_th, "v_out": v_out, "current": current}.items():
+            if one is None or is_traced(one) or (lost := np.sum(~np.isfinite(one))) == 0:
+                continue
+            raise ValueError(
+                f"{name} has {several(int(lost), 'value')} that {'is' if lost == 1 else 'are'} not "
+                "finite; cut the records to samples that are, or give a Recording to identify_skin"
             )
         of = feed, MAXIMUM_LIKELIHOOD, sample_rate, pulse_rate
         lane, known = given(v_th, v_out, *of, resolution)

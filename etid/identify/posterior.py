@@ -236,7 +236,7 @@ def posterior(
     """`Fit.posterior`."""
     if draws < 1:
         raise ValueError(f"draws is {draws}; it must be at least 1, as in 1000")
-    (load, least, own), known, cov = minimum_of(fit, recording, driver)
+    (load, least, own), known, cov = minimum_of(fit, recording, driver, "fit.posterior")
     if isinstance(load, Load) and load.gains.discrepancy is not None:
         raise ValueError(
             "the circuit of this fit leaves more than noise, and ± contain it; the unknown numbers "
@@ -267,9 +267,15 @@ def posterior(
 
 
 def minimum_of(
-    fit: Fit, recording: Recording | None, driver: Driver | None
+    fit: Fit, recording: Recording | None, driver: Driver | None, call: str
 ) -> tuple[Minimum, Known, Float[np.ndarray, "element element"]]:
     """The minimum of a fit, what is known besides, and the covariance of the log elements.
+
+    Args:
+        fit: The fit.
+        recording: Its recording, if the fit does not know it.
+        driver: Its driver, if there is a recording.
+        call: What the user called, such as `fit.posterior`.
 
     Raises:
         ValueError: As in `Fit.posterior`.
@@ -277,7 +283,7 @@ def minimum_of(
     require("fit", fit, Fit)
     measured = fit.measured if recording is None else None
     if measured is None:
-        lane, known, cov = given(fit, recording, driver)
+        lane, known, cov = given(fit, recording, driver, call)
         return Minimum.of(lane, known, fit), known, cov
     told = Told.of(fit.method)
     of, own = solved(measured, fit.circuit, chain_of(measured), told), told.bounds
@@ -288,7 +294,7 @@ def minimum_of(
 
 
 def given(
-    fit: Fit, recording: Recording | None, driver: Driver | None
+    fit: Fit, recording: Recording | None, driver: Driver | None, call: str = "fit.posterior"
 ) -> tuple[Harmonics, Known, Float[np.ndarray, "element element"]]:
     """The harmonics of a fit, what is known besides, and the covariance of the log elements.
 
@@ -298,7 +304,7 @@ def given(
     require("fit", fit, Fit)
     recording, driver = fit.source_or_own(recording, driver)
     if recording is None:
-        raise fit.without_source("fit.posterior")
+        raise fit.without_source(call)
     recording, feed = fed(recording, driver)
     fit.refuse_batch()
     if fit.method.partition("(")[0] != MAXIMUM_LIKELIHOOD.name:
@@ -380,7 +386,7 @@ def _effects(fit: Fit, recording: Recording | None, driver: Driver | None) -> Ef
             "a budget needs the driver of the fit, with the harmonics of its calibrations; "
             "identify it by maximum likelihood, and pass it as in fit.budget(recording, driver)"
         )
-    lane, known, _ = given(fit, recording, driver)
+    lane, known, _ = given(fit, recording, driver, "fit.budget")
     estimator = named(fit.method)
     found = taken(fits_of([lane], driver, known.driver, fit.circuit, estimator), 0)
     assert found.by_tolerance is not None

@@ -117,7 +117,7 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
     """`Fit.profile`."""
     names = fit.circuit.names()
     require_element(name, fit.circuit)
-    least, known, cov = minimum_of(fit, recording, driver)
+    least, known, cov = minimum_of(fit, recording, driver, "fit.profile")
     number = names.index(name)
     if known.elements is not None and known.elements.width[number] <= FIXED:
         raise ValueError(f"{name} is fixed, so it has no profile; take another element")

@@ -59,7 +59,6 @@ def plot(
     | `plot(fit)` | one pulse measured and predicted [V]; residual [mV]; its spectrum | 3 |
     | `plot(fit)` without whole periods or elements | the same without the spectrum | 2 |
     | `plot(fit, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
-    | `plot(fit, show="residual")` | residual [mV], its correlations | 3 |
     | `plot(fit)` of `identify_impedance` | Nyquist and Bode: fit, measured | 3 |
     | `plot(fit.measured)` | Nyquist and Bode: measured | 3 |
     | `plot(fits[0], recording, driver)` | as `plot(fit)`, for one of several fits | 3 |
@@ -70,6 +69,7 @@ def plot(
     | `plot({label: driver, fit or circuit})` | several of these in one diagram | 2 |
     | `plot(posterior)` | each element, and each two of them, beside the errors of the fit | n² |
     | `plot(profile)` | how much worse the fit becomes if one element has another value | 1 |
+    | `plot(fit, show="residual")` | the same as `plot(fit.residual())` | 4 or 2 |
     | `plot(residual)` | residual [mV], its size by frequency, its correlations by lag | 4 |
     | `plot(residual)` of `identify_impedance` | size by frequency, correlation of neighbours | 2 |
     | `plot(fits)` | each element by subject, conditions side by side | one per element |
@@ -88,13 +88,9 @@ def plot(
     Unusable fits and drivers have a red title, and their points are hollow.
 
     The points of `show="impedance"` are what the recording measures in bands of frequency, with two
-    standard errors. `show="residual"` adds the autocorrelation of the residual and its
-    cross-correlation with V_th; of white noise, 99 % lie in the band. Aliases of the edges
-    exceed it, too.
-
-    `plot(fit.residual())` draws what a fit leaves relative to the noise that it expects, so that
-    aliases and the colour of noise do not matter: 95 % of the bands of frequency and 99 % of the
-    lags of such noise lie in the grey bands.
+    standard errors. Those of `show="residual"` are what a fit leaves relative to the noise that it
+    expects, so that aliases and the colour of noise do not matter: 95 % of the bands of frequency
+    and 99 % of the lags of such noise lie in the grey bands.
 
     The picture of a selection shows magnitude [kΩ] and phase [deg] in bands of frequency with two
     standard errors; points are pale where the error exceeds 30 %. Below are the deviations of each
@@ -124,8 +120,8 @@ def plot(
 
     Raises:
         TypeError: etid cannot draw `x`, or `recording` or `driver` is missing.
-        ValueError: `x` is empty, the picture needs another number of axes, or `size` is given
-            together with `axes`.
+        ValueError: `x` is empty, the picture needs another number of axes, `size` is given together
+            with `axes`, or a fit has no residual.
     """
     from etid.plotting.style import Canvas, titled
 
@@ -184,17 +180,13 @@ def _draw(
             )
     if isinstance(x, Fit):
         recording, driver = x.source_or_own(recording, driver)
-        if recording is None and x.measured is not None and show == "residual":
-            raise ValueError("a fit to a measured impedance has no residual in time")
     with_current = recording is not None and "current" in recording.samples
     with mpl.rc_context(style.PAPER):
         match x, recording, driver:
+            case Fit(), _, _ if show == "residual":
+                return residuals.draw_residual(canvas, x.residual(recording, driver))
             case Fit(), Recording(), _ if driver is not None or with_current:
-                draw = {
-                    "impedance": judging.draw_impedance,
-                    "residual": judging.draw_residual,
-                    "pulse": pulses.draw_fit,
-                }[show]
+                draw = pulses.draw_fit if show == "pulse" else judging.draw_impedance
                 return draw(canvas, x, recording, driver)
             case Selection(), Recording(), _ if driver is not None or with_current:
                 return judging.draw_selection(canvas, x, recording, driver)

@@ -124,7 +124,7 @@ def _inexact(
         estimator = cast("MaximumLikelihood", named(found.method))
     driver = feed if isinstance(feed, Driver) else None
     alone = dataclasses.replace(found, method=str(estimator))
-    lane, known, _ = given(alone, seen.recording, driver)
+    lane, known, _ = given(alone, seen.recording, driver, "fit.plot")
     std = discrepancy(found, lane, known)
     return estimator.accept, np.interp(np.log(frequency), np.log(lane.frequency), std)
 

@@ -1,11 +1,12 @@
 """Pictures of impedances over frequency, with bands of two standard errors."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogFormatterMathtext
 
 from etid.circuits.circuit import with_slopes
 from etid.plotting import Impedance
@@ -27,13 +28,83 @@ from etid.results.fit import Fit
 POINTS = 300
 
 
+class Bode(NamedTuple):
+    """Axes of magnitude and phase, and the sizes and symbols of their units; data are in SI.
+
+    Attributes:
+        magnitude: Axes of |Z|.
+        phase: Axes of the phase [deg].
+        z: Unit of |Z| [Ω].
+        f: Unit of the frequency [Hz].
+    """
+
+    magnitude: Axes
+    phase: Axes
+    z: tuple[float, str] = (1e3, "kΩ")
+    f: tuple[float, str] = (1e3, "kHz")
+
+    def curve(
+        self,
+        frequency: Float[np.ndarray, " frequency"],
+        z: Complex[np.ndarray, " frequency"],
+        **look: Any,
+    ) -> None:
+        """Draw an impedance [Ω] over frequency [Hz]."""
+        self.magnitude.plot(frequency / self.f[0], np.abs(z) / self.z[0], **look)
+        self.phase.plot(frequency / self.f[0], np.degrees(np.unwrap(np.angle(z))), **look)
+
+    def band(
+        self,
+        frequency: Float[np.ndarray, " frequency"],
+        z: Complex[np.ndarray, " frequency"],
+        stderr: Float[np.ndarray, "2 frequency"],
+        **look: Any,
+    ) -> None:
+        """Draw two standard errors of ln |Z| and of the phase [rad]."""
+        size, angle = np.abs(z) / self.z[0], np.unwrap(np.angle(z))
+        factor = np.exp(np.minimum(2 * stderr[0], 50))  # it is finite beyond every axis
+        look = {"alpha": 0.25, "linewidth": 0, **look}
+        self.magnitude.fill_between(frequency / self.f[0], size / factor, size * factor, **look)
+        ends = np.degrees([angle - 2 * stderr[1], angle + 2 * stderr[1]])
+        self.phase.fill_between(frequency / self.f[0], *ends, **look)
+
+    def points(
+        self,
+        frequency: Float[np.ndarray, " point"],
+        z: Complex[np.ndarray, " point"],
+        stderr: Float[np.ndarray, " point"] | None,
+        **look: Any,
+    ) -> None:
+        """Draw measured impedances [Ω], with two standard errors of ln Z if they are known."""
+        at, size, degrees = frequency / self.f[0], np.abs(z) / self.z[0], np.degrees(np.angle(z))
+        ends = turn = None
+        if stderr is not None:
+            ends = size * (1 - np.exp(-2 * stderr)), size * (np.exp(2 * stderr) - 1)
+            turn = np.degrees(2 * stderr)
+        self.magnitude.errorbar(at, size, ends, fmt="o", **look)
+        self.phase.errorbar(at, degrees, turn, fmt="o", **look)
+
+    def frame(self, z: Complex[np.ndarray, " value"]) -> None:
+        """Label the axes, with limits that show these impedances [Ω] even if the bands are wide."""
+        self.magnitude.set(ylabel=f"|Z| [{self.z[1]}]", xscale="log", yscale="log")
+        self.phase.set(ylabel="phase [deg]", xscale="log")
+        sizes = np.abs(z[np.isfinite(z)]) / self.z[0]
+        if sizes.size:
+            self.magnitude.set_ylim(sizes.min() / 1.5, sizes.max() * 1.5)
+        low, high = self.phase.get_ylim()
+        self.phase.set_ylim(max(low, -180.0), min(high, 180.0))
+        plain_ticks(self.magnitude.yaxis)
+        for axis in (self.magnitude.xaxis, self.phase.xaxis):
+            axis.set_major_formatter(LogFormatterMathtext() if self.f[0] == 1.0 else "{x:g}")
+
+
 def draw_bode(canvas: Canvas, things: Mapping[str, Impedance]) -> np.ndarray:
     """Magnitude and phase of impedances (the paper's figure 9), with bands."""
-    magnitude, phase = axes = canvas(2, 1, (6.0, 5.0), sharex=True).ravel()
+    axes = canvas(2, 1, (6.0, 5.0), sharex=True).ravel()
+    bode = Bode(*axes)
     # From the paper's pulse rate to half its sample rate.
     frequency = np.geomspace(60.0, 100e3, POINTS)
-    kilohertz = frequency / 1e3
-    sizes, banded, failed = [], False, []
+    drawn, banded, failed = [], False, []
     for i, (label, thing) in enumerate(things.items()):
         z, errors = _with_errors(thing, frequency)
         known = np.isfinite(errors).all()
@@ -45,64 +116,17 @@ def draw_bode(canvas: Canvas, things: Mapping[str, Impedance]) -> np.ndarray:
             if thing.verdict == "approximate":
                 label = f"{label}, approximate"
             label = label if known else f"{label}, no standard error"
-        curve(magnitude, phase, frequency, z, label=typeset(label), **look)
-        sizes.append(np.abs(z) / 1e3)
+        bode.curve(frequency, z, label=typeset(label), **look)
+        drawn.append(z)
         if known:
             banded = True
-            band = {"color": look["color"], "alpha": 0.25, "linewidth": 0}
-            factor = np.exp(np.minimum(2 * errors[0], 50))  # it is finite beyond every axis
-            magnitude.fill_between(kilohertz, sizes[-1] / factor, sizes[-1] * factor, **band)
-            angle, turn = np.unwrap(np.angle(z)), 2 * errors[1]
-            phase.fill_between(kilohertz, *np.degrees([angle - turn, angle + turn]), **band)
-    phase.set(xlabel="frequency [kHz]")
-    frame(magnitude, phase, np.concatenate(sizes))
+            bode.band(frequency, z, errors, color=look["color"])
+    bode.phase.set(xlabel="frequency [kHz]")
+    bode.frame(np.concatenate(drawn))
     legend(axes)
-    titled(magnitude, failed or ["bands: two standard errors" if banded else ""], good=not failed)
+    said = failed or ["bands: two standard errors" if banded else ""]
+    titled(bode.magnitude, said, good=not failed)
     return axes
-
-
-def curve(
-    magnitude: Axes,
-    phase: Axes,
-    frequency: Float[np.ndarray, " frequency"],
-    z: Complex[np.ndarray, " frequency"],
-    **look: Any,
-) -> None:
-    """Draw an impedance [Ω] over frequency [Hz], in kΩ and degrees over kHz."""
-    kilohertz = frequency / 1e3
-    magnitude.plot(kilohertz, np.abs(z) / 1e3, **look)
-    phase.plot(kilohertz, np.degrees(np.unwrap(np.angle(z))), **look)
-
-
-def points(
-    magnitude: Axes,
-    phase: Axes,
-    frequency: Float[np.ndarray, " point"],
-    z: Complex[np.ndarray, " point"],
-    stderr: Float[np.ndarray, " point"] | None,
-    **look: Any,
-) -> None:
-    """Draw measured impedances [Ω], with two standard errors of ln Z if they are known."""
-    kilohertz, size, degrees = frequency / 1e3, np.abs(z) / 1e3, np.degrees(np.angle(z))
-    ends = turn = None
-    if stderr is not None:
-        ends = size * (1 - np.exp(-2 * stderr)), size * (np.exp(2 * stderr) - 1)
-        turn = np.degrees(2 * stderr)
-    magnitude.errorbar(kilohertz, size, ends, fmt="o", **look)
-    phase.errorbar(kilohertz, degrees, turn, fmt="o", **look)
-
-
-def frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> None:
-    """Label the axes, with limits that show the curves even if the bands are wide."""
-    magnitude.set(ylabel="|Z| [kΩ]", xscale="log", yscale="log")
-    phase.set(ylabel="phase [deg]", xscale="log")
-    sizes = sizes[np.isfinite(sizes)]
-    if sizes.size:
-        magnitude.set_ylim(sizes.min() / 1.5, sizes.max() * 1.5)
-    low, high = phase.get_ylim()
-    phase.set_ylim(max(low, -180.0), min(high, 180.0))
-    plain_ticks(magnitude.yaxis)
-    phase.xaxis.set_major_formatter("{x:g}")
 
 
 def _with_errors(

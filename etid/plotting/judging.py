@@ -1,17 +1,15 @@
-"""Pictures that judge fits: impedances beside the measured one, residuals, rival circuits."""
+"""Pictures that judge fits: impedances beside the measured one, and rival circuits."""
 
 from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, LogFormatterMathtext, NullLocator
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from etid.circuits.display import scaled
-from etid.identify.arguments import fed
-from etid.identify.predict import predict
 from etid.plotting.bands import CLEAR, Bands, bands, continuous, used
-from etid.plotting.impedances import POINTS, curve, frame, points
+from etid.plotting.impedances import POINTS, Bode
 from etid.plotting.style import (
     BLUE,
     COLOURS,
@@ -24,7 +22,6 @@ from etid.plotting.style import (
     legend,
     listed,
     nth,
-    typeset,
     without_elements,
 )
 from etid.recordings.preflight import Inspected
@@ -42,22 +39,17 @@ def draw_impedance(
 ) -> np.ndarray:
     """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
     if not listed(fit):
-        return _empty(canvas, fit, recording.path)
+        axes = canvas.three((7.5, 4.6))
+        for axis in axes:
+            without_elements(axis)
+        judged(axes[0], recording.path, fit)
+        return axes
     recording, known = continuous(recording, driver)
     lane = used(Inspected.of(recording), known, fit.circuit, fit.remarks)
     measured = bands(lane, known, fit.circuit)
     clear = measured.stderr <= CLEAR
     points = measured.frequency[clear], measured.z[clear], measured.stderr[clear]
     return _diagrams(canvas, fit, recording.path, *points)
-
-
-def _empty(canvas: Canvas, fit: Fit, path: str) -> np.ndarray:
-    """Three panels of a fit without elements."""
-    axes = canvas.three((7.5, 4.6))
-    for axis in axes:
-        without_elements(axis)
-    judged(axes[0], path, fit)
-    return axes
 
 
 def draw_measured(canvas: Canvas, fit: Fit | None, measured: MeasuredImpedance) -> np.ndarray:
@@ -76,81 +68,28 @@ def _diagrams(
 ) -> np.ndarray:
     """Nyquist and Bode diagrams of measured points, with standard errors of ln Z, and of a fit."""
     nyquist, magnitude, phase = axes = canvas.three((7.5, 4.6))
+    unit, ohms = scaled("ohm", float(np.median(np.abs(z))))
+    hertz = (1.0, "Hz") if frequency.min() < SLOW else (1e3, "kHz")
+    bode = Bode(magnitude, phase, (unit, ohms), hertz)
     label = "measured" if stderr is None else "measured, ± 2 standard errors"
     point: Any = {"ms": 4, "lw": 0.8, "color": BLUE, "label": label}
-    (of_z, ohms), (of_f, hertz) = scaled("ohm", float(np.median(np.abs(z)))), (1e3, "kHz")
-    if frequency.min() < SLOW:
-        of_f, hertz = 1.0, "Hz"
-    smooth = np.geomspace(frequency.min() / 1.3, frequency.max() * 1.3, POINTS)
-    fitted = None if fit is None else np.asarray(fit.circuit.response(smooth)) * (1e3 / of_z)
-    # The panels below show thousandths of what they get.
-    frequency, smooth, z = frequency * (1e3 / of_f), smooth * (1e3 / of_f), z * (1e3 / of_z)
-    size = None if stderr is None else 2 * stderr * np.abs(z) / 1e3
-    if fit is not None and fitted is not None:
+    if fit is not None:
         line: Any = {"color": ORANGE, "lw": 1.3, "label": "fit"}
-        nyquist.plot(np.real(fitted) / 1e3, -np.imag(fitted) / 1e3, **line)
-        curve(magnitude, phase, smooth, fitted, **line)
+        smooth = np.geomspace(frequency.min() / 1.3, frequency.max() * 1.3, POINTS)
+        fitted = np.asarray(fit.circuit.response(smooth))
+        nyquist.plot(np.real(fitted) / unit, -np.imag(fitted) / unit, **line)
+        bode.curve(smooth, fitted, **line)
         judged(nyquist, path, fit, *listed(fit))
-    nyquist.errorbar(np.real(z) / 1e3, -np.imag(z) / 1e3, size, size, fmt="o", **point)
+    size = None if stderr is None else 2 * stderr * np.abs(z) / unit
+    nyquist.errorbar(np.real(z) / unit, -np.imag(z) / unit, size, size, fmt="o", **point)
     nyquist.set(xlabel=f"Re Z [{ohms}]", ylabel=f"-Im Z [{ohms}]")
     nyquist.set_aspect("equal", adjustable="datalim")
-    points(magnitude, phase, frequency, z, stderr, **point)
-    frame(magnitude, phase, np.abs(z) / 1e3)
-    magnitude.set(ylabel=f"|Z| [{ohms}]")
+    bode.points(frequency, z, stderr, **point)
+    bode.frame(z)
     for axis in (magnitude, phase):
-        axis.set(xlabel=f"frequency [{hertz}]")
-    form: Any = LogFormatterMathtext() if hertz == "Hz" else "{x:g}"
-    magnitude.xaxis.set_major_formatter(form)
-    if hertz == "Hz":
-        phase.xaxis.set_major_formatter(form)
+        axis.set(xlabel=f"frequency [{hertz[1]}]")
     legend(axes)
     return axes
-
-
-def draw_residual(
-    canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None
-) -> np.ndarray:
-    """The residual, its autocorrelation, and its cross-correlation with V_th or the current.
-
-    A residual of white noise has correlations within the band at 99 % of the lags.
-    """
-    if not listed(fit):
-        return _empty(canvas, fit, recording.path)
-    whole, own, with_input = axes = canvas.three((7.5, 4.6), wide=True)
-    residual = predict(recording, driver, fit.circuit) - recording.v_out
-    known = np.isfinite(residual)
-    whole.plot(1e3 * recording.time, 1e3 * residual, color=BLUE, lw=0.5)
-    whole.set(xlabel="time [ms]", ylabel="residual [mV]")
-    cause = fed(recording, driver)[0].cause
-    clean, cause_known = residual[known], recording.samples[cause].values[known]
-    _correlation(own, clean, clean, "autocorrelation\nof the residual")
-    name = typeset("V_th") if cause == "v_th" else "current"
-    _correlation(with_input, clean, cause_known, f"correlation\nwith earlier {name}")
-    judged(whole, recording.path, fit)
-    legend(axes, own.get_legend_handles_labels()[0])
-    return axes
-
-
-def _correlation(
-    axis: Axes, one: Float[np.ndarray, " time"], other: Float[np.ndarray, " time"], label: str
-) -> None:
-    """Correlation coefficients of `one` with `other` at earlier times, over the lag.
-
-    99 % of white noise does not exceed 2.58 standard deviations.
-    """
-    one, other = one - one.mean(), other - other.mean()
-    lags = np.arange(-60, 61)
-    norm = np.sqrt(np.sum(one**2) * np.sum(other**2))
-    size = one.size
-    products = [
-        np.dot(one[max(lag, 0) : size + min(lag, 0)], other[max(-lag, 0) : size - max(lag, 0)])
-        for lag in lags
-    ]
-    band = 2.58 / np.sqrt(size)
-    band_label = "99 % of white noise (aliases of the edges exceed it)"
-    axis.axhspan(-band, band, color="0.85", lw=0, label=band_label)
-    axis.vlines(lags, 0.0, np.array(products) / norm, color=INK, lw=0.9)
-    axis.set(xlabel="lag [samples]", ylabel=label)
 
 
 def draw_selection(
@@ -169,7 +108,7 @@ def draw_selection(
     recording, known = continuous(recording, driver)
     lane = used(Inspected.of(recording), known, chosen.fit.circuit, chosen.fit.remarks)
     found = [bands(lane, known, one.fit.circuit) for one in fitted]
-    _measured_and_fitted(axes[0], axes[1], fitted, found[0])
+    _measured_and_fitted(Bode(*axes[:2]), fitted, found[0])
     _deviations(axes[2], axes[3], found)
     legend(axes)
     judged(axes[0], recording.path, selection.fit, chosen.name, *listed(selection.fit))
@@ -184,9 +123,7 @@ def _look(number: int) -> dict[str, Any]:
     return line | {"lw": width, "zorder": layer}
 
 
-def _measured_and_fitted(
-    magnitude: Axes, phase: Axes, fitted: list[Candidate], measured: Bands
-) -> None:
+def _measured_and_fitted(bode: Bode, fitted: list[Candidate], measured: Bands) -> None:
     """The measured impedance, pale where it is uncertain, and those of the candidates."""
     clear = measured.stderr <= CLEAR
     look: Any = {"color": INK, "ms": 3.5, "lw": 0.9, "capsize": 2.0}
@@ -195,18 +132,17 @@ def _measured_and_fitted(
         (~clear & (measured.stderr <= 1.0), None, 0.3),
     ):
         of = measured.frequency[some], measured.z[some], measured.stderr[some]
-        points(magnitude, phase, *of, label=label, alpha=alpha, **look)
+        bode.points(*of, label=label, alpha=alpha, **look)
     frequency = np.geomspace(measured.frequency[0], measured.frequency[-1], POINTS)
-    sizes = [np.abs(measured.z[clear]) / 1e3]
+    drawn = [measured.z[clear]]
     for number, one in enumerate(fitted):
         label = f"{one.name}, chosen"
         if number:
             verdict = "" if one.fit.verdict == "successful" else f", {one.fit.verdict}"
             label = f"{one.name}, 2 log evidence {one.evidence:+.0f}{verdict}"
-        z = np.asarray(one.fit.circuit.response(frequency))
-        sizes.append(np.abs(z) / 1e3)
-        curve(magnitude, phase, frequency, z, label=label, **_look(number))
-    frame(magnitude, phase, np.concatenate(sizes))
+        drawn.append(np.asarray(one.fit.circuit.response(frequency)))
+        bode.curve(frequency, drawn[-1], label=label, **_look(number))
+    bode.frame(np.concatenate(drawn))
 
 
 def _deviations(magnitude: Axes, phase: Axes, found: list[Bands]) -> None:

@@ -30,7 +30,6 @@ from etid.recordings.recording import (
 )
 from etid.recordings.untrusted import (
     attribute,
-    attribute_names,
     check_size,
     local_link,
     translated,
@@ -185,7 +184,7 @@ class Scan:
                     f"lies more than {limits.DEPTH} groups deep",
                     remedy="Use a path such as 's01/dry/03'",
                 )
-            present = attribute_names(group)
+            present = list(group.attrs)
             near = "kind" in present or near_miss("kind", present)
             names = sorted(group, key=_natural)
             if near or "v_out" in names:
@@ -335,7 +334,7 @@ class Scan:
         check_size(dataset)
         before = len(self.problems)
         known, of = schema.at("dataset attribute"), f"{field.name}."
-        present = attribute_names(dataset)
+        present = list(dataset.attrs)
         found = self._attributes(dataset, present, known, path, of)
         self._near_misses(present, known, path, of)
         if len(self.problems) == before and found.get("unit") != field.unit:

@@ -9,7 +9,7 @@ change.
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Required, TypedDict
+from typing import Any, Literal
 
 import numpy as np
 
@@ -341,32 +341,6 @@ DESCRIBING = {
 
 
 FILTERS = "v_out_filter", "current_filter"  # known filters of one channel
-
-Number = float | np.integer | np.floating
-
-
-class Given(TypedDict, total=False):
-    """The fields as a caller gives them, before `Field.checked`; for type checkers.
-
-    A type checker reads only names that are written out. A test compares them with the fields.
-    """
-
-    path: str
-    sample_rate: Required[Number]
-    pulse_rate: Required[Number]
-    r_load: Number | str | None
-    subject: Label | None
-    session: Label | None
-    site: Label | None
-    condition: Label | None
-    electrode: Label | None
-    trial: Label | None
-    calibration: str | Sequence[str] | None
-    adc_range: Sequence[Number] | None
-    hold: str | None
-    instrument: str | None
-    v_out_filter: str | None
-    current_filter: str | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

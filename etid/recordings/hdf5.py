@@ -23,7 +23,7 @@ from etid.recordings.fields import Metadata
 from etid.recordings.recording import AbstractSource, RecordingError
 from etid.recordings.replacing import check_ending, replacing_hdf5
 from etid.recordings.study import Study
-from etid.recordings.untrusted import attribute, attribute_names, guarded, translated
+from etid.recordings.untrusted import attribute, guarded, translated
 
 
 def read(path: str | os.PathLike[str]) -> Study:
@@ -93,7 +93,7 @@ def _check_root(file: h5py.File, name: str) -> None:
     for field in schema.at("file attribute").values():
         with translated(name, field=field.name):
             if field.name not in file.attrs:
-                near = near_miss(field.name, attribute_names(file))
+                near = near_miss(field.name, file.attrs)
                 hint = f", did you mean {field.name} by {near}?" if near else ""
                 raise RecordingError(f"is missing{hint}", remedy=remedy)
             try:

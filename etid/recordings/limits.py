@@ -7,16 +7,12 @@ the limit.
 
 SAMPLES = 1 << 27  # samples of one record: 11 minutes at 200 kHz, 1 GB as float64
 TRIALS = 1 << 21  # trials of one stack: each trial is an object in memory
-CHUNK = 1 << 28  # [bytes] size of an HDF5 chunk, which is unpacked as a whole
 FREE = 1 << 24  # [bytes] size that may be declared without a check of the stored size
-FREE_TRIALS = 10_000  # trials that may be declared without this check
 # Declared bytes per stored byte, above FREE. Compression shrinks converter codes by a factor below
 # 10. Deflate reaches its maximum of 1032 only if all samples are equal.
 COMPRESSION = 100
-# Nested groups, soft links in a chain, or nested tables and lists of a mapping; Python allows 1000
-# nested calls.
+# Nested groups, or nested tables and lists of a mapping; Python allows 1000 nested calls.
 DEPTH = 50
-NAMES = 1000  # attributes of one group or dataset (the schema has 13), columns of a table
-ATTRIBUTE = 1 << 24  # [bytes] size of one attribute: the labels of TRIALS trials
+NAMES = 1000  # lines of a matrix that are channels too, elements of a circuit
 MAPPING = 1 << 22  # [bytes] size of a mapping file
 FITS = 1 << 24  # rows of a file of fits

@@ -13,7 +13,7 @@ import importlib
 import inspect
 from collections.abc import Container, Hashable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple, SupportsFloat, Unpack
+from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,6 @@ from etid.recordings.fields import (
     LABELS,
     SIGNALS,
     AbstractFields,
-    Given,
     Metadata,
     metadata_from,
     real,
@@ -153,7 +152,7 @@ class Recording(Overviewed, AbstractFields):
         v_out: npt.ArrayLike | Samples | None = None,
         *,
         current: npt.ArrayLike | Samples | None = None,
-        **fields: Unpack[Given],
+        **fields: Any,
     ) -> None:
         try:
             given = {"v_th": v_th, "v_out": v_out, "current": current}

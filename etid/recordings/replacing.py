@@ -3,22 +3,16 @@
 import contextlib
 import os
 import pathlib
-import platform
 import secrets
 from collections.abc import Iterator
 from typing import Any
 
+import filelock
 import h5py
 
 from etid.recordings.errors import RecordingError
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
 HDF5 = (".h5", ".hdf5", ".hdf")
-OWNER = "process "  # the first word in a lock, before its number
 
 
 def check_ending(path: str | os.PathLike[str], endings: tuple[str, ...] = HDF5) -> None:
@@ -93,53 +87,24 @@ def replace_text(path: str | os.PathLike[str], text: str) -> None:
 def claimed(path: str | os.PathLike[str]) -> Iterator[None]:
     """Refuse the block if another process is in such a block for the same file.
 
-    The operating system locks `path.lock` during the block. It ends the lock with the process, so a
-    file that a killed process has left locks nothing. Where there are no locks, as on some network
-    file systems, no process is refused.
+    The lock is the empty file `.NAME.lock` beside it. It ends with the process, so one that a
+    killed process has left locks nothing.
     """
     target = pathlib.Path(path)
-    lock = target.with_name(f"{target.name}.lock")
-    held = _locked(lock, target)
-    before = os.read(held, len(OWNER))
-    if before not in (b"", OWNER.encode()):
-        os.close(held)
+    lock = filelock.FileLock(target.with_name(f".{target.name}.lock"), timeout=0)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
         raise RecordingError(
-            f"{lock.name} beside it is no lock of etid",
+            "another program is writing it",
             file=str(target),
-            remedy="Move or rename that file, or name another file to write",
-        )
-    with contextlib.suppress(OSError):  # on a full disk the lock holds, but names nobody
-        os.truncate(held, 0)
-        os.lseek(held, 0, os.SEEK_SET)
-        os.write(held, f"{OWNER}{os.getpid()} on {platform.node()}".encode())
+            remedy="Wait until it has ended, or name another file",
+        ) from None
+    except OSError as error:
+        raise unwritable(target, error) from error
     try:
         yield
     finally:
-        lock.unlink(missing_ok=True)
-        os.close(held)
-
-
-def _locked(lock: pathlib.Path, target: pathlib.Path) -> int:
-    """Descriptor of the lock file, locked."""
-    while True:
-        try:
-            held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise unwritable(target, error) from error
-        try:
-            if fcntl is not None:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            owner = os.read(held, 1000).decode("utf-8", "replace")
-            os.close(held)
-            raise RecordingError(
-                f"{owner or 'another process'} is writing it",
-                file=str(target),
-                remedy="Wait until it has ended, or name another file",
-            ) from None
-        except OSError:  # this file system has no locks
-            return held
-        with contextlib.suppress(OSError):
-            if os.path.samestat(os.fstat(held), os.stat(lock)):
-                return held
-        os.close(held)  # its process has ended and removed it since it was opened
+        with contextlib.suppress(OSError):  # Windows removes it when it is free
+            os.unlink(lock.lock_file)
+        lock.release()

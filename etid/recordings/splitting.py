@@ -1,4 +1,4 @@
-"""Parts of one long record: by pauses between its pulses, a trigger, or what says who fires."""
+"""Parts of one long record: by pauses between its pulses, or by a trigger."""
 
 from typing import NamedTuple
 
@@ -8,8 +8,6 @@ from jaxtyping import Float, Int
 from etid.circuits.display import several
 from etid.recordings.errors import RecordingError
 from etid.signals.pulse_train import find_pulses
-
-WHOLE = 0.1  # largest distance of a value from the whole number that it means
 
 
 class Parts(NamedTuple):
@@ -29,7 +27,6 @@ def split(
     sample_rate: float,
     pulse_rate: float,
     trigger: Float[np.ndarray, " _"] | None = None,
-    which: Float[np.ndarray, " _"] | None = None,
     *,
     cut: bool = True,
 ) -> Parts:
@@ -39,15 +36,11 @@ def split(
     from one rising edge, where the trigger rises through the middle of its range, to the next, up
     to the first pause. A pulse may precede its trigger by a tenth of a period.
 
-    With `which`, whose value says what fires, a part is a train of pulses with one value. The value
-    is that of a tenth of a period behind the start of a pulse (`firing`).
-
     Args:
         cause: Unloaded voltage or current.
         sample_rate: Samples per second [Hz].
         pulse_rate: Pulses per second [Hz].
         trigger: Trigger.
-        which: Channel with one value for each that fires.
         cut: Whether trains that an end of the record cuts may be left out.
 
     Raises:
@@ -56,14 +49,7 @@ def split(
     """
     period = sample_rate / pulse_rate
     edges = find_pulses(cause, sample_rate, pulse_rate).edges
-    if which is not None:
-        own = firing(which, edges, period)
-        trains = [
-            train
-            for pulses in np.split(edges, np.flatnonzero(np.diff(own) != 0) + 1)
-            for train in _trains(pulses, period)
-        ]
-    elif trigger is not None:
+    if trigger is not None:
         trains = _after_edges(trigger, cause, edges, period)
     else:
         trains = _trains(edges, period)
@@ -84,23 +70,6 @@ def split(
             remedy="Record a period without pulses before the first and behind the last",
         )
     return Parts(whole, len(trains) - len(whole))
-
-
-def firing(
-    which: Float[np.ndarray, " time"], edges: Int[np.ndarray, " edge"], period: float
-) -> Int[np.ndarray, " edge"]:
-    """The value of each pulse in a channel that says what fires: a whole number."""
-    at = np.minimum(edges + round(period / 10), which.size - 1)
-    values = which[at]
-    wrong = np.flatnonzero(~(np.abs(values - np.round(values)) < WHOLE))
-    if wrong.size:
-        raise RecordingError(
-            f"is {values[wrong[0]]:g} at sample {at[wrong[0]]}, must be a whole number at each "
-            "pulse",
-            field="split",
-            remedy="Name the channel whose value says which electrode fires",
-        )
-    return np.round(values).astype(int)
 
 
 def _trains(edges: Int[np.ndarray, " edge"], period: float) -> list[Int[np.ndarray, " _"]]:

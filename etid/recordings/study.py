@@ -5,14 +5,14 @@ import difflib
 import itertools
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from etid.circuits.display import several
 from etid.circuits.overview import ROWS, Overview, Overviewed
-from etid.recordings.fields import LABELS, Given, Label, Metadata, wanted_labels
+from etid.recordings.fields import LABELS, Label, Metadata, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
 from etid.signals.missing import unmasked
 
@@ -122,7 +122,7 @@ class Study(Overviewed, Mapping[str, Recording]):
         v_out: npt.ArrayLike,
         *,
         calibrations: Mapping[float, tuple[npt.ArrayLike, npt.ArrayLike]] | None = None,
-        **fields: Unpack[Given],
+        **fields: Any,
     ) -> "Study":
         """A study in memory from arrays, as in a notebook.
 

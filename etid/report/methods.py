@@ -12,9 +12,9 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import etid.estimators.online
 import etid.identify.jointly
-import etid.nonlinear.identify
-import etid.online.state  # these modules describe their methods
+import etid.nonlinear.identify  # these modules describe their methods
 from etid.circuits.display import as_symbol, per_cent, quantity, several
 from etid.estimators.estimator import Description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, described

@@ -147,8 +147,8 @@ class HasSource(Generic[Circuit]):
             recording: Its recording. `identify_skin` tells it to the fit; one of several fits, as
                 in `fits[0]`, does not know it.
             driver: Its driver, if `recording` is given.
-            show: `"pulse"`, `"impedance"` or `"residual"`. A fit of `identify_impedance` has only
-                the picture of its impedance.
+            show: `"pulse"`, `"impedance"`, which is the same for a fit of `identify_impedance`, or
+                `"residual"`, the picture of `residual`.
             axes: As in `etid.plot`.
             size: As in `etid.plot`.
             title: As in `etid.plot`; None leaves the titles out.
@@ -158,6 +158,7 @@ class HasSource(Generic[Circuit]):
 
         Raises:
             TypeError: The recording is not known.
+            ValueError: The fit has no `residual`.
         """
         drawn = _of_higher_layer("etid.plotting", "plot")
         return drawn(self, recording, driver, show=show, axes=axes, size=size, title=title)

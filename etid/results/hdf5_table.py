@@ -16,7 +16,6 @@ from etid.recordings.schema import NAME, version_problem
 from etid.recordings.untrusted import (
     attribute,
     check_size,
-    check_texts,
     guarded,
     local_link,
     translated,
@@ -140,8 +139,6 @@ class Table:
                 what = f"of type {column.dtype}" if text is None else "text"
                 raise RecordingError(f"is {what}, must be {kind}", remedy=REMEDY)
             check_size(column)
-            if text is not None and text.length is None:
-                check_texts(column, self.name)
         return column
 
     def read(self, column: h5py.Dataset, rows: Any = ()) -> np.ndarray:

@@ -3,7 +3,6 @@
 import itertools
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 
 from etid.circuits.display import between, number, several
@@ -31,44 +30,32 @@ class Parameter(NamedTuple):
 
 
 class Presented(Module):
-    """The parts of a fit under the names of lmfit.
-
-    Attributes:
-        circuit: Identified elements.
-        support: How well the data support the circuit; None without a likelihood.
-        rrse: Root relative squared error.
-    """
-
-    circuit: eqx.AbstractVar[Any]
-    support: eqx.AbstractVar[Any]
-    rrse: eqx.AbstractVar[Any]
+    """The parts of a `Fit` under the names of lmfit."""
 
     @property
-    def success(self) -> Any:
+    def success(self: Any) -> Any:
         """Whether the fit can be used, as `usable`; an array for a batch."""
-        of: Any = self
-        return of.usable
+        return self.usable
 
     @property
-    def params(self) -> dict[str, Parameter]:
+    def params(self: Any) -> dict[str, Parameter]:
         """Value, standard error and unit of each element [SI], as in `fit.params["r_s"].stderr`.
 
         `table` has the same numbers as columns, with changes, quality and verdict.
         """
-        of: Any = self
-        columns = of.table()
+        columns = self.table()
         return {
             name: Parameter(columns[name], columns[f"{name}_stderr"], unit)
             for name, unit in self.circuit.units().items()
         }
 
     @property
-    def aic(self) -> Any:
+    def aic(self: Any) -> Any:
         """−2 log L + 2 p for p free elements (Akaike 1974), as `bic`."""
         return self._criterion(2.0)
 
     @property
-    def bic(self) -> Any:
+    def bic(self: Any) -> Any:
         """−2 log L + p ln n for p free elements and n real numbers in the data (Schwarz 1978).
 
         L has a constant that depends on the data, so that only fits to the same data compare. A
@@ -78,16 +65,15 @@ class Presented(Module):
         terms = np.nan if self.support is None else np.asarray(self.support.terms, float)
         return self._criterion(np.log(terms))
 
-    def _criterion(self, of_each: Any) -> Any:
+    def _criterion(self: Any, of_each: Any) -> Any:
         lost = np.nan if self.support is None else np.asarray(self.support.deviance, float)
         found = np.zeros(np.shape(self.rrse)) + lost + of_each * self.free
         return found if found.ndim else float(found)
 
     @property
-    def free(self) -> int:
+    def free(self: Any) -> int:
         """Number of elements that are not fixed."""
-        of: Any = self
-        return len(self.circuit.names()) - len(fixed(of.method))
+        return len(self.circuit.names()) - len(fixed(self.method))
 
 
 def report(fit: "Fit") -> str:

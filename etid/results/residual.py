@@ -215,7 +215,8 @@ class Residual(Overviewed):
         if (of := self.by_period) is not None:
             beyond = float(np.mean(of.rms > of.limit))
             rows.append(("difference of periods", several(of.rms.size, "period"), per_cent(beyond)))
-        sizes = [f"{rounded(self.rms, 3)} times the noise"]
+        size = rounded(self.rms, 3)
+        sizes = ["as large as the noise" if size == "1" else f"{size} times the noise"]
         if (known := self.in_time[np.isfinite(self.in_time)]).size:
             sizes.insert(0, f"{rounded(1e3 * float(np.sqrt(np.mean(known**2))), 3)} mV")
         title = f"Residual of {self.title}: rms {', '.join(sizes)}"

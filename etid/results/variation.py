@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
-from jaxtyping import Float
 
 from etid.circuits.display import per_cent, quantity, several
 from etid.circuits.overview import Overview, Overviewed
@@ -67,23 +66,23 @@ class Variation(Overviewed):
     unused: Sequence[str]
 
     def _overview(self) -> Overview:
-        rows = [
-            # A search for the minimum at 0 ends near it.
-            (
-                f"between {name}{'' if name == REST else 's'}",
-                *(_per_cent(of) if of > 1e-3 * max(part) else "0 %" for of in part),
-            )
+        parts = {
+            f"between {name}{'' if name == REST else 's'}": part
             for name, part in self.between.items()
+        }
+        # A search for the minimum at 0 ends near it.
+        rows = [
+            (name, *(_per_cent(of) if of > 1e-3 * max(part) else "0 %" for of in part))
+            for name, part in parts.items()
         ]
-        rows.append(("error of a fit", _per_cent(self.error), "", ""))
         of = f"each {self.driver}" if self.driver else "all"
+        rows.append(("error of a fit", _per_cent(self.error), "", ""))
         rows.append((f"error of the driver of {of}", _per_cent(self.driver_error), "", ""))
-        title = f"{self.element} of {several(self.fits, 'fit')}: "
-        title += quantity(self.mean, self.unit, self.stderr)
-        heads = "variation", "standard deviation", "95 % from", "to"
+        mean = quantity(self.mean, self.unit, self.stderr)
+        title = f"{self.element} of {several(self.fits, 'fit')}: {mean}"
         names = ", ".join(self.unused)
         notes = [f"no groups of several fits by {names}"] if names else []
-        return Overview(title, rows, heads, notes=notes)
+        return Overview(title, rows, ("variation", "standard deviation", "95 % from", "to"), notes)
 
 
 def _per_cent(part: float) -> str:
@@ -122,32 +121,28 @@ def variation(
         raise ValueError(f"the element is {element!r}, must be one of {', '.join(units)}")
     check_names(dict.fromkeys((*by, *([driver] if driver else []))), LABELS, "label")
     good = fits.usable()
-    values = np.asarray(getattr(good.circuit, element))
-    place = list(units).index(element)
-    shared = np.asarray(good.fit.shared_cov)[:, place, place]
-    own = np.asarray(good.cov)[:, place, place] - shared
-    y = np.log(values)
-    s, a = (np.sqrt(np.maximum(of, 0.0)) / values for of in (own, shared))
+    values, place = np.asarray(getattr(good.circuit, element)), list(units).index(element)
+    total, shared = (np.asarray(of)[:, place, place] for of in (good.cov, good.fit.shared_cov))
+    s, a = (np.sqrt(np.maximum(of, 0.0)) / values for of in (total - shared, shared))
     levels = _levels([good.labels[name].astype(str) for name in by], by, len(values))
     if len(values) < 2 or not levels:
         raise ValueError(f"no variation by {', '.join(by)} in {several(len(values), 'usable fit')}")
-    names = good.labels[driver].astype(str) if driver else np.zeros(y.size)
+    names = good.labels[driver].astype(str) if driver else np.zeros(values.size)
     member = (names[:, None] == np.unique(names)).astype(float)
     # One error for a driver: that of each fit grows with its element, and would explain it.
     drivers = member * np.sqrt(a**2 @ member / member.sum(0))
-    model = _Model.of(y, s, list(levels.values()), drivers)
-    best, mean, stderr = model.fitted()
-    between = {}
-    for row, name in enumerate(levels):
-        ends = model.interval(row, best)
-        between[name] = Part(float(best[row]), *ends)
-    middle = float(np.exp(mean))
+    model = _Model(np.log(values), s, list(levels.values()), drivers)
+    best = model.best()
+    between = {
+        name: Part(float(best[i]), *model.interval(i, best)) for i, name in enumerate(levels)
+    }
+    _, _, mean, stderr = model.at(best)
     return Variation(
         element=element,
         unit=units[element],
         fits=len(values),
-        mean=middle,
-        stderr=middle * stderr,
+        mean=float(np.exp(mean)),
+        stderr=float(np.exp(mean) * stderr),
         between=between,
         error=float(np.median(s)),
         driver_error=float(np.median(a)),
@@ -160,8 +155,7 @@ def _levels(
     columns: Sequence[np.ndarray], names: Sequence[str], count: int
 ) -> dict[str, np.ndarray]:
     """Number of the group of each fit, by level; the last level are the fits themselves."""
-    found: dict[str, np.ndarray] = {}
-    groups = 1
+    found, groups = {}, 1
     for depth, name in enumerate(names, start=1):
         keys = np.array(["\0".join(parts) for parts in zip(*columns[:depth], strict=True)])
         place = np.unique(keys, return_inverse=True)[1]
@@ -171,152 +165,73 @@ def _levels(
     return found | ({REST: np.arange(count)} if count > groups else {})
 
 
-class _Inverse(NamedTuple):
-    """V⁻¹ at some standard deviations; see `_Model`.
-
-    Attributes:
-        w: Diagonal of W.
-        gram: ŪᵀWŪ.
-        kernel: K̄.
-        along: v; V⁻¹1 = W Ū v.
-        total: 1ᵀV⁻¹1.
-        logs: ln |V|.
-    """
-
-    w: np.ndarray
-    gram: np.ndarray
-    kernel: np.ndarray
-    along: np.ndarray
-    total: float
-    logs: float
-
-
-@dataclasses.dataclass(frozen=True)
 class _Model:
-    """The restricted likelihood of logarithms.
+    """The restricted likelihood of logarithms y with errors s, by the equations of mixed models.
 
-    Their covariance is V = W⁻¹ + U S² Uᵀ. W is diagonal and has the errors of the fits and the last
-    level, U the other effects, S their standard deviations. With K = S (1 + S UᵀWU S)⁻¹ S
-    (Woodbury), v = (−K UᵀW1, 1) and Ū = (U, 1),
+    With weights W (errors of the fits and the last level), standard deviations S of the others and
+    a flat prior of μ, the effects u solve C u = RᵀW y with R = (Z S, A, 1), C = E + RᵀW R and
+    E = diag(1, …, 1, 0) (Henderson, Biometrics 31, 1975, 423-447). The deviance is
 
-        V⁻¹ = W − W U K UᵀW,    P = V⁻¹ − V⁻¹1 1ᵀV⁻¹ / 1ᵀV⁻¹1 = W − W Ū K̄ ŪᵀW,
-        K̄ = (K, 0; 0, 0) + v vᵀ / 1ᵀV⁻¹1.
-
-    Attributes:
-        y: Logarithms.
-        noise: Their squared errors.
-        effects: Ū: groups of all levels but the last, errors of the drivers, 1.
-        level: (effect, level but the last), 1 where the effect is of this level.
-        spread: Standard deviation of the logarithms.
+        −2 ln L = ln |C| − Σ ln w + Σ w (y − R u)² + uᵀE u.
     """
 
-    y: np.ndarray
-    noise: np.ndarray
-    effects: np.ndarray
-    level: np.ndarray
-    spread: float
-
-    @classmethod
-    def of(
-        cls, y: np.ndarray, s: np.ndarray, levels: Sequence[np.ndarray], drivers: np.ndarray
-    ) -> "_Model":
-        """The model.
-
-        Args:
-            y: Logarithms.
-            s: Their errors.
-            levels: Group of each logarithm, by level, numbered from 0; in the last level each has a
-                group of its own.
-            drivers: Errors of the drivers, (logarithm, driver).
-        """
-        spread = float(np.std(y)) or 1.0
+    def __init__(
+        self, y: np.ndarray, s: np.ndarray, levels: Sequence[np.ndarray], drivers: np.ndarray
+    ) -> None:
+        """`levels`: group of each y, by level; in the last one each has its own."""
+        self.middle, self.spread = float(np.mean(y)), float(np.std(y)) or 1.0
+        self.y, self.noise = y - self.middle, s**2 + (FINE * self.spread) ** 2
         groups = [np.eye(of.max() + 1)[of] for of in levels[:-1]]
-        effects = np.hstack([*groups, drivers, np.ones((y.size, 1))])
+        self.effects = np.hstack([*groups, drivers, np.ones((y.size, 1))])
         owner = np.repeat(np.arange(len(groups)), [of.shape[1] for of in groups])
-        level = np.eye(effects.shape[1], owner.size) @ np.eye(len(groups))[owner]
-        return cls(y, s**2 + (FINE * spread) ** 2, effects, level, spread)
+        # (effect, level but the last), 1 where the effect is of this level.
+        self.level = np.eye(self.effects.shape[1], owner.size) @ np.eye(len(groups))[owner]
 
-    def deviance(self, std: np.ndarray) -> float:
-        """−2 ln of the restricted likelihood."""
-        of = self._inverse(std)
-        return of.logs + float(np.log(of.total) + self.y @ self._projected(of))
+    def at(self, std: np.ndarray) -> tuple[float, np.ndarray, float, float]:
+        """The deviance, its slope by the logarithms of `std`, μ, and the standard error of μ.
 
-    def _inverse(self, std: np.ndarray) -> _Inverse:
+        The slope by σ_r² is tr(P Z_r Z_rᵀ) − |Z_rᵀP y|², with P y = W (y − R u).
+        """
         w = 1 / (self.noise + std[-1] ** 2)
-        gram = self._gram(w)
-        scale = np.where(self.level.any(1), self.level @ std[:-1], 1.0)[:-1]
-        inner = np.eye(scale.size) + scale[:, None] * gram[:-1, :-1] * scale
-        k = scale[:, None] * np.linalg.solve(inner, np.diag(scale))
-        along = np.append(-k @ gram[:-1, -1], 1.0)
-        total = float(along @ gram[:, -1])
-        logs = float(np.linalg.slogdet(inner)[1] - np.sum(np.log(w)))
-        kernel = np.pad(k, (0, 1)) + np.outer(along, along) / total
-        return _Inverse(w, gram, kernel, along, total, logs)
+        r = self.effects * np.where(self.level.any(1), self.level @ std[:-1], 1.0)
+        prior = np.append(np.ones(r.shape[1] - 1), 0.0)
+        matrix = np.diag(prior) + r.T @ (w[:, None] * r)
+        inverse = np.linalg.inv(matrix)
+        u = inverse @ (r.T @ (w * self.y))
+        left = w * (self.y - r @ u)
+        logs = np.linalg.slogdet(matrix)[1] - np.sum(np.log(w))
+        last = np.sum(w) - np.sum((r @ inverse) * r * w[:, None] ** 2) - left @ left
+        own = 2 * (1 - np.diag(inverse) - u**2) @ self.level
+        deviance, mean = float(logs + left @ (left / w) + prior @ u**2), self.middle + float(u[-1])
+        return deviance, np.append(own, 2 * std[-1] ** 2 * last), mean, inverse[-1, -1] ** 0.5
 
-    def _gram(self, weight: np.ndarray) -> np.ndarray:
-        """Ūᵀ diag(weight) Ū."""
-        return self.effects.T @ (weight[:, None] * self.effects)
-
-    def _projected(self, of: _Inverse) -> np.ndarray:
-        """P y."""
-        weighted = of.w * (self.y - np.mean(self.y))  # P 1 = 0, but for the digits that it costs
-        return weighted - of.w * (self.effects @ (of.kernel @ (self.effects.T @ weighted)))
-
-    def smallest(self, start: np.ndarray, fixed: int | None = None) -> tuple[np.ndarray, float]:
-        """Standard deviations with the smallest deviance, by Fisher's scoring of their logarithms.
-
-        Args:
-            start: Where to begin.
-            fixed: Level whose standard deviation stays as it is.
-        """
-        std = np.maximum(start, 0.05 * self.spread)
+    def best(self, start: np.ndarray | None = None, fixed: int | None = None) -> np.ndarray:
+        """Standard deviations with the smallest deviance; the one of level `fixed` stays."""
+        std = np.full(self.level.shape[1] + 1, 0.3 * self.spread) if start is None else start.copy()
         free = np.arange(std.size) != fixed
-        if fixed is not None:
-            std[fixed] = start[fixed]
-        for _ in range(60):
-            slope, matrix = self._derivatives(std)
-            slope, matrix = slope[free], matrix[np.ix_(free, free)]
-            step = np.linalg.solve(matrix + 1e-6 * np.eye(slope.size), -slope)  # for std 0
-            std[free] = np.maximum(std[free] * np.exp(np.clip(step, -2, 2)), FINE * self.spread)
-            if np.abs(step @ slope) < 1e-5:  # of the deviance
-                break
-        return std, self.deviance(std)
 
-    def _derivatives(self, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Slope of the deviance by the ln σ_r, and the expected matrix of its second derivatives.
+        def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
+            std[free] = np.exp(logs)
+            deviance, slope, *_ = self.at(std)
+            return deviance, slope[free]
 
-        By σ_r² they are tr(P M_r) − yᵀP M_r P y and tr(P M_r P M_s), M_r = Z_r Z_rᵀ: sums over the
-        effects of a level, and over the logarithms for the last one.
-        """
-        of = self._inverse(std)
-        squared, cubed = self._gram(of.w**2), self._gram(of.w**3)
-        rest = np.eye(of.along.size) - of.kernel @ of.gram
-        p, pp = of.gram @ rest, rest.T @ squared @ rest  # ŪᵀPŪ and ŪᵀPPŪ
-        residual, lost = self._projected(of), of.kernel @ squared
-        own = np.diag(p) - (self.effects.T @ residual) ** 2
-        last = np.sum(of.w) - np.trace(lost) - residual @ residual
-        edge = np.diag(pp) @ self.level
-        corner = np.sum(of.w**2) - 2 * np.sum(of.kernel * cubed) + np.sum(lost * lost.T)
-        matrix = np.block([[self.level.T @ p**2 @ self.level, edge[:, None]], [edge, corner]])
-        scale = 2 * std**2
-        slope = scale * np.append(own @ self.level, last)
-        return slope, scale[:, None] * matrix * scale
-
-    def fitted(self) -> tuple[Float[np.ndarray, " level"], float, float]:
-        """The standard deviations, the mean and its standard error."""
-        best, _ = self.smallest(np.full(self.level.shape[1] + 1, 0.3 * self.spread))
-        of = self._inverse(best)
-        mean = float((of.w * self.y) @ (self.effects @ of.along)) / of.total
-        return best, mean, float(1 / np.sqrt(of.total))
+        if free.any():
+            begin = np.log(np.maximum(std[free], 0.05 * self.spread))
+            limits, ends = [(np.log(FINE * self.spread), None)], {"ftol": 1e-12, "gtol": 1e-8}
+            found = scipy.optimize.minimize(
+                objective, begin, jac=True, bounds=limits * begin.size, options=ends
+            )
+            std[free] = np.exp(found.x)
+        return std
 
     def interval(self, row: int, best: np.ndarray) -> tuple[float, float]:
         """The ends of the 95 % interval of one standard deviation."""
-        least = self.deviance(best)
+        limit = self.at(best)[0] + 3.84  # χ², 95 %
 
         def beyond(std: float) -> float:
             start = best.copy()
             start[row] = std
-            return self.smallest(start, row)[1] - least - 3.84  # χ², 95 %
+            return self.at(self.best(start, row))[0] - limit
 
         at, low = float(best[row]), 0.0
         if beyond(0.0) > 0:

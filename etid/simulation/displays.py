@@ -1,4 +1,4 @@
-"""A stream of pulses at a display, as `etid live --file` plays it.
+"""A stream of pulses at a display, as `etid-live --file` plays it.
 
 All pulses have the amplitude of the unloaded record. After a third of the stream the electrodes of
 the fourth to sixth row become wet, after two thirds the last electrode loses contact.

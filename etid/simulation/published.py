@@ -1,7 +1,7 @@
 """Published values of the paper: resistors, tables I to IV and RRSE, in SI units and per cent.
 
 *Towards On-line Fingertip Bio-impedance Identification for Enhancement of Electro-tactile
-Rendering*. Scenes simulate these values, and `etid.paper` compares its results with them.
+Rendering*. Scenes simulate these values, and `benchmarks.paper` compares its results with them.
 """
 
 from etid.simulation.transformer import SkinLoad

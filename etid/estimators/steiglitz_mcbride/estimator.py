@@ -1,7 +1,7 @@
-"""Steiglitz-McBride in time, as in the paper, and equation error, its first iteration.
+"""Steiglitz-McBride in time, as in the paper.
 
-They have no covariance. Their estimates are not at the minimum of their model. If the minimum is
-far from the estimate, the verdict is `biased`.
+It has no covariance. Its estimate is not at the minimum of its model. If the minimum is far from
+the estimate, the verdict is `biased`.
 """
 
 import dataclasses
@@ -52,7 +52,7 @@ class SteiglitzMcBride(AbstractEstimator):
     """The paper's estimator: Z_th and the skin as discrete filters, by prefiltered least squares.
 
     Attributes:
-        iterations: Number of iterations, at least one.
+        iterations: Number of iterations, at least one; 1 is least squares of the equation error.
     """
 
     name = "steiglitz_mcbride"
@@ -146,24 +146,5 @@ class SteiglitzMcBride(AbstractEstimator):
             "predicts the terminal voltage best was kept. The method accounts neither for trigger "
             "delays nor for the noise that both of its regressors share, and gives no standard "
             "errors.",
-            conditions=(*CHECKED, NEAR_MINIMUM),
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class EquationError(SteiglitzMcBride):
-    """The first iteration of Steiglitz-McBride: least squares of the equation error."""
-
-    name = "equation_error"
-
-    iterations: int = dataclasses.field(default=1, init=False)
-
-    def describe(self) -> Description:
-        """The text for a methods section."""
-        return Description(
-            words="equation error",
-            text="Z_th and the load were estimated as discrete filters by least squares of the "
-            "equation error, the first iteration of Steiglitz and McBride (1965). It is biased by "
-            "noise and gives no standard errors.",
             conditions=(*CHECKED, NEAR_MINIMUM),
         )

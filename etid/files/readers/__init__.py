@@ -1,7 +1,7 @@
 """Readers for files of other formats, one module per format.
 
 A reader is a context manager `opened(path, folder)` that returns the `Contents` of the file. It may
-create temporary files in `folder`. `npz` is an exception: it returns recordings.
+create temporary files in `folder`.
 
 `etid.files.formats` declares the formats and names the reader of each.
 """

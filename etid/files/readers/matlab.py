@@ -19,7 +19,6 @@ import scipy.io
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
 from etid.files.channel import Channel, Contents
-from etid.files.readers import matlab_5
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.untrusted import attribute, check_size, guarded, local_link
@@ -157,7 +156,6 @@ def _dataset(data: h5py.Dataset) -> _Variable:
 
 def _whole(path: pathlib.Path) -> dict[str, _Variable]:
     """Variables of version 5 and older."""
-    matlab_5.check(path)
     try:
         # Variables that SciPy leaves out are named where they are asked for.
         with warnings.catch_warnings(record=True) as said:

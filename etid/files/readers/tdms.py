@@ -4,9 +4,7 @@ Channel c of group g has the name `g/c`.
 """
 
 import contextlib
-import io
 import logging
-import os
 import pathlib
 import struct
 from collections.abc import Iterator
@@ -32,7 +30,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
         stack.callback(console.removeFilter, _silent)
         # Pass an open file: npTDMS does not close its own file after an error, and might read an
         # index file instead.
-        source = stack.enter_context(_Bounded(io.FileIO(path)))
+        source = stack.enter_context(path.open("rb"))
         file = stack.enter_context(nptdms.TdmsFile.open(source))
         found = [
             (f"{group.name}/{channel.name}", channel)
@@ -41,22 +39,6 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
         ]
         by_name = dict(found)
         yield Contents(tuple(name for name, _ in found), lambda name: _channel(name, by_name[name]))
-
-
-class _Bounded(io.BufferedReader):
-    """A file that allocates no more than what is left of it for one read.
-
-    npTDMS reads the declared length of each text, and Python allocates it first.
-    """
-
-    def __init__(self, raw: io.FileIO) -> None:
-        super().__init__(raw)
-        self._size = os.fstat(raw.fileno()).st_size
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """At most `size` bytes."""
-        left = max(self._size - self.tell(), 0)
-        return super().read(left if size is None or size < 0 else min(size, left))
 
 
 def _silent(_: logging.LogRecord) -> bool:

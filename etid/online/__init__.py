@@ -1,1 +1,0 @@
-"""The tracker: one fit per pulse for each electrode of a display."""
