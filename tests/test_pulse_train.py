@@ -54,7 +54,7 @@ def noisy(request):
     [
         *((1.5, factor) for factor in (1 / 3, 0.99, 2.0, 40.0)),
         *((2.0, factor) for factor in (0.5, 1.01, 3.0, 1000.0)),
-        *((6.0, factor) for factor in (1 / 3, 0.5, 0.99, 2.0, 60.0)),
+        *((6.0, factor) for factor in (2e-3, 1 / 3, 0.5, 0.99, 2.0, 60.0)),
     ],
 )
 def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):

@@ -75,7 +75,7 @@ def _layout(periods: int, samples: int) -> _Layout:
     least = math.ceil(FEWEST / of_harmonic)
     most = max(bins.size // 64, least)
     # Below the pulse rate are drifts, and 1/f noise that is stronger than at any harmonic.
-    edges = [1 if periods > 1 else min(UNSEEN, bins.size // 2)]
+    edges = [min(1, bins.size - 1) if periods > 1 else min(UNSEEN, bins.size // 2)]
     while (after := edges[-1] + min(max(least, edges[-1] // 5), most)) + least <= bins.size:
         edges.append(after)
     width, edges = np.diff([*edges, bins.size]), np.array(edges)
