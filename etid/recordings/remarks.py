@@ -71,10 +71,8 @@ _TEXTS = {
         "recovery after a pulse is slower than its fall; etid has no model of it."
     ),
     Remark.not_noise: (
-        "The residual is not white noise: neighbouring impedances miss alike, or another passive "
-        "circuit misses by less, or a few impedances miss by far the most (leave them out, or give "
-        "stderr). Up to 1 % of Z, as by errors of calibration, this widens the standard errors; "
-        "above, it is a misfit."
+        "The residual is not white noise. Up to 1 % of Z, as by errors of calibration, this widens "
+        "the standard errors; above, it is a misfit."
     ),
     Remark.positive_imaginary: (
         "Im Z is positive at most frequencies, as of an inductance. If the file holds -Im Z, give "
