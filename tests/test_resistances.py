@@ -74,6 +74,7 @@ def test_numbers_of_options_have_the_letters_of_resistances(tmp_path, capsys):
     words = ["import", str(table), "-o", str(tmp_path / "a.h5"), "--v-th", "a", "--v-out", "b"]
     words += ["--scale", "1", "--pulse-rate", "60Hz", "--sample-rate"]
     for text in ("200k", "200kHz", "200e3"):
+        (tmp_path / "a.h5").unlink(missing_ok=True)
         assert cli.main([*words, text]) == 0
         assert "at 200000 Hz (command), pulses at 60 Hz" in capsys.readouterr().out
     with pytest.raises(SystemExit):
