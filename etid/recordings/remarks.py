@@ -45,7 +45,9 @@ _TEXTS = {
         "The steps of the converter exceed the noise; the fit weighted the rounding errors by size."
     ),
     Remark.pulse_rate_counted: (
-        "The distance of the pulses does not match pulse_rate; the rate was measured in the record."
+        "The distance of the pulses does not match pulse_rate; the rate was measured in the "
+        "record. Or was a sample lost or recorded twice in both records? Then ± are too large, or "
+        "the fit is biased."
     ),
     Remark.circuits_close: (
         "Another circuit is likely too; the standard errors contain the difference between them."
