@@ -5,6 +5,7 @@ import pytest
 
 import etid
 from etid.estimators.lanes import Bins, Harmonics
+from etid.recordings.causes import why_misaligned
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.lags import lags_of, whole_lag
@@ -59,6 +60,14 @@ def test_the_lag_is_found_to_less_than_a_sample(sample_rate, snr_db, late):
         assert lag is not None, name
         assert abs(lag - late) < 1.0, name
         assert (whole_lag(lag) == 0) == (late == 0.0)
+
+
+def test_noise_that_hides_the_edges_is_named_before_other_causes():
+    found = [simulate(snr_db=3.0, seed=seed)["resistor"] for seed in range(6)]
+    hidden = [one for one in map(Inspected.of, found) if preflight(one) == "misaligned"]
+    assert hidden
+    for one in hidden:
+        assert "times the power of the noise: it may hide the edges" in why_misaligned(one)
 
 
 def test_opposite_polarity_and_lags_out_of_reach_are_misaligned():

@@ -144,7 +144,7 @@ HOLDING = {  # against the droop of V_th
 
 @pytest.mark.parametrize(
     ("number", "snr_db"),
-    [*zip([0, 1, 2, 0, 1, 2, 0], [20.0, 25.0, 30.0, 35.0, 40.0, 60.0, 80.0], strict=True)],
+    [*zip([0, 1, 2, 0, 1, 2, 0, 6], [20.0, 25.0, 30.0, 35.0, 40.0, 60.0, 80.0, 80.0], strict=True)],
 )
 def test_no_good_record_stays_at_its_extreme_value(number, snr_db):
     """A slow layer may hold V_out against the droop of V_th: its top has another shape."""

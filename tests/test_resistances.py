@@ -66,3 +66,22 @@ def test_what_is_no_resistance_is_refused_alike(text, tmp_path, capsys):
 def test_a_resistance_in_a_file_of_etid_is_a_number(tmp_path):
     with pytest.raises(etid.RecordingError, match="must be a finite real number"):
         schema.at("group attribute")["r_load"].parse("98k8")
+
+
+def test_numbers_of_options_have_the_letters_of_resistances(tmp_path, capsys):
+    table = tmp_path / "a.csv"
+    table.write_text("a,b\n1,2\n3,4\n")
+    words = ["import", str(table), "-o", str(tmp_path / "a.h5"), "--v-th", "a", "--v-out", "b"]
+    words += ["--scale", "1", "--pulse-rate", "60Hz", "--sample-rate"]
+    for text in ("200k", "200kHz", "200e3"):
+        (tmp_path / "a.h5").unlink(missing_ok=True)
+        assert cli.main([*words, text]) == 0
+        assert "at 200000 Hz (command), pulses at 60 Hz" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        cli.main([*words, "fast"])
+    assert "'fast' is no number; write it as 200e3, 200k or 200kHz" in capsys.readouterr().err
+    arguments = cli.parser(["fit"]).parse_args(
+        ["fit", "a.h5", "-o", "b.h5", "--fix", "r_s=20k", "--bound", "r_p=98k8:1M"]
+    )
+    assert arguments.fix == [("r_s", 20e3)]
+    assert arguments.bound == [("r_p", (98.8e3, 1e6))]

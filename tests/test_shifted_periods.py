@@ -7,7 +7,7 @@ import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.recordings.causes import how_shifted
 from etid.recordings.preflight import Inspected
-from etid.recordings.remarks import Remark
+from etid.recordings.remarks import Remark, texts
 from tests.skins import off
 from tests.test_changes import falling, recorded
 
@@ -119,3 +119,11 @@ def test_elements_behind_a_lost_sample_are_right(records, load):
     told = (np.asarray(fits.fit.remarks) & int(Remark.periods_shifted)) > 0
     fifth = [fault == ("doubled", "v_th", 15_000) for fault in all_faults]
     np.testing.assert_array_equal(told, np.logical_not(fifth))
+
+
+def test_a_sample_that_both_records_lost_is_a_likely_cause_of_another_pulse_rate():
+    """Its fit was successful with ± that are four times as large, and no word."""
+    one = rung("dry", snr_db=60.0).simulate(1)[TRIAL]
+    both = {name: np.delete(getattr(one, name), 4000) for name in ("v_th", "v_out")}
+    (said,) = texts(Inspected.of(one.replace(**both)).remarks)
+    assert "a sample lost or recorded twice in both records" in said

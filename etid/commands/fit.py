@@ -20,6 +20,7 @@ from etid.identify.jointly import identify_jointly
 from etid.recordings import hdf5
 from etid.recordings.errors import RecordingError, install
 from etid.recordings.replacing import HDF5, claimed
+from etid.recordings.resistance import number
 from etid.results.driver import Order
 from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
@@ -126,7 +127,7 @@ def _written_as(option: str, example: str) -> Callable[[str], Any]:
         name, _, numbers = text.rpartition("=")
         try:
             values = [
-                None if is_range and not one else float(one) for one in numbers.split(between)
+                None if is_range and not one else number(one) for one in numbers.split(between)
             ]
         except ValueError:
             values = []

@@ -16,6 +16,7 @@ from etid.files.readers.delimited import DIALECT
 from etid.recordings.errors import RecordingError
 from etid.recordings.fields import DECLARED, SIGNALS
 from etid.recordings.replacing import HDF5
+from etid.recordings.resistance import number
 
 __doc__ = f"{__doc__}\n\nSuffixes of the files: {', '.join(formats.SUFFIXES)}."
 
@@ -97,6 +98,7 @@ def _option(
 ) -> None:
     metavar = metavar or ("NUMBER" if kind in (int, float) else "NAME")
     option = f"--{name.replace('_', '-')}"
+    kind = _number if kind is float else kind
     parser.add_argument(option, type=kind, nargs=nargs, metavar=metavar, help=help)
 
 
@@ -159,6 +161,16 @@ def _folder(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Outcome:
         **dataclasses.asdict(found),
     }
     return Outcome(str(found), data)
+
+
+def _number(text: str) -> float:
+    """The value of --sample-rate and of other numbers."""
+    try:
+        return number(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no number; write it as 200e3, 200k or 200kHz"
+        ) from None
 
 
 def _delimiter(text: str) -> str:

@@ -148,6 +148,8 @@ def by_place(names: Sequence[str]) -> list[str]:
 def chosen(names: Iterable[str], name: str, field: str) -> None:
     """Raise an error if a name is missing or occurs twice."""
     every = list(names)
+    if not every:
+        raise RecordingError("the file is empty", remedy="Export or copy it again")
     alike = [one for one in every if one.rpartition("#")[0] == name]
     if name and name not in every and len(alike) > 1:
         raise RecordingError(

@@ -93,11 +93,31 @@ def _clock(time: Channel, factor: float, length: int) -> float:
         worst = int(np.argmax(distance))  # argmax returns the first NaN, if there is one
         # The rounding of a printed time must pass, a missing or repeated sample (1) must not.
         if not distance[worst] <= 0.25:
+            gap = _gap(stamps(), step)
+            wrong = f"sample {start + worst} is wrong by {rounded(distance[worst])} sample periods"
             raise RecordingError(
-                f"is not uniform: sample {start + worst} is wrong by "
-                f"{rounded(distance[worst])} sample periods",
+                f"is not uniform: {gap or wrong}",
                 field="time",
-                remedy="Resample the data, or give the sample_rate of the instrument instead",
+                remedy="Record again, or import a part without a gap"
+                if gap
+                else "Resample the data, or give the sample_rate of the instrument instead",
             )
         start += block.size
     return float(1 / step)
+
+
+def _gap(stamps: Iterator[np.ndarray], step: float) -> str:
+    """Where the longest time between two samples is, if it is no single sample period."""
+    longest, where, before, number = 1.8 * step, "", np.nan, 0
+    for block in stamps:
+        apart = np.diff(block, prepend=before)
+        at = int(np.argmax(np.nan_to_num(apart)))
+        if apart[at] > longest:
+            longest = apart[at]
+            last = block[at] - apart[at]
+            where = (
+                f"samples are missing before sample {number + at}, from {last:.6g} to "
+                f"{block[at]:.6g} s"
+            )
+        before, number = block[-1], number + block.size
+    return where

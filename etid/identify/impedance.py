@@ -28,7 +28,7 @@ from etid.identify.study import table
 from etid.precision import in_float64, one_thread
 from etid.recordings.errors import RecordingError
 from etid.recordings.fields import LABELS
-from etid.recordings.remarks import Remark, texts
+from etid.recordings.remarks import Remark
 from etid.results.data import MeasuredImpedance, with_data
 from etid.results.fit import Fit, IdentificationError
 from etid.results.fits import Fits, concatenated
@@ -83,7 +83,7 @@ def identify_impedance(
     measured = _measured((frequency, impedance, stderr))
     fit = with_data(_choice(measured, options).fit, measured)
     if throw and not fit.usable:
-        causes = " ".join([fit.note, *texts(int(fit.remarks))])
+        causes = " ".join([fit.note, *fit.remarked])
         raise IdentificationError(f"impedance: {fit.verdict}. {causes}", fit)
     return fit
 

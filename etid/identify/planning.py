@@ -27,6 +27,7 @@ from etid.precision import in_float64
 from etid.recordings.causes import why_implausible, why_misaligned, why_rates_differ
 from etid.recordings.preflight import Inspected, inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
+from etid.recordings.remarks import Remark, texts
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit, IdentificationError, Support
 from etid.results.instrument import Effects
@@ -35,7 +36,10 @@ from etid.results.verdicts import message, verdict
 TOGETHER = 640_000  # samples that are inspected together; their arrays take tens of MB
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 # Verdicts whose message says more of a recording.
-EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples", "saturated")
+EXPLAINED = (
+    *("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples", "saturated"),
+    "biased",
+)
 T = TypeVar("T")
 
 Load = Callable[[int], tuple[Recording, AbstractFeed]]
@@ -208,6 +212,8 @@ def explained(seen: Inspected, name: str) -> str:
         found = why_rates_differ(seen)
     elif name == "misaligned":
         found = why_misaligned(seen)
+    elif name == "biased":
+        found = " ".join(texts(seen.remarks & Remark.pulse_rate_counted))
     elif name == "wrong_unit":
         found = why_implausible(seen.by_current or seen)
     elif name == "saturated" and seen.has_current:

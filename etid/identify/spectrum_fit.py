@@ -26,6 +26,7 @@ from etid.recordings.remarks import Remark
 from etid.results.data import MeasuredImpedance
 from etid.results.fit import Fit, Support, complex_rrse
 from etid.results.method_options import options_of
+from etid.results.residual import RUNS, TAILS, noise_in
 from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.solvers.matrices import inverse
 
@@ -297,13 +298,11 @@ def _judged(
     assert least.equations.rows is not None
     e, slope = least.terms, least.equations.rows[0].T
     n, square = e.size, least.chi2
-    parts = e.reshape(2, -1)
-    of_steps = np.mean((parts[:, 1:] - parts[:, :-1]) ** 2) / 2
+    of_steps, usual = noise_in(e)
     rho = 1 - of_steps / np.where(square > 0, square, 1.0)
-    usual = (np.median(np.abs(e)) / 0.6745) ** 2  # the median of the size of a normal number
-    # By chance 1 spectrum in 4 000 has such runs, 5 of 1 000 000 of 40 frequencies such tails.
     unit = least.spectrum.noise**2
-    signs = [rho > 3.5 / n**0.5, unit * np.sum(e**2) > passive.most, square > 2.5**2 * usual]
+    runs, tails = rho > RUNS / n**0.5, square > TAILS**2 * usual
+    signs = [runs, unit * np.sum(e**2) > passive.most, tails]
     noise = np.stack([of_steps, passive.square / unit, usual])
     excess = np.sqrt(unit * np.max(np.where(np.stack(signs), square - noise, 0.0)))
     fewer = np.where(excess > 0, np.clip((1 + rho) / (1 - rho), 1.0, n), 1.0)

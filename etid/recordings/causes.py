@@ -9,6 +9,7 @@ from etid.circuits.display import rounded, several
 from etid.recordings.preflight import Inspected
 from etid.signals.lags import lags_of, shifted, whole_lag
 
+NOISY = 10.0  # signal over noise, in power; noise hides edges at 5 dB in a third of records
 LOG = logging.getLogger("etid")
 
 
@@ -67,6 +68,12 @@ def why_misaligned(inspected: Inspected) -> str:
         return (
             f"v_out is {rounded(ratio, 3)} times as large as v_th. Their units or scales "
             "differ; is one of them in mV and the other in V?"
+        )
+    power = np.diagonal(inspected.covariance) / np.square(inspected.sigma) - 1
+    if np.isnan(inspected.correlated) and power.min() < NOISY:
+        return (
+            f"The signal has {rounded(float(power.min()))} times the power of the noise: it may "
+            "hide the edges. Reduce the noise, or average, before you look for another cause."
         )
     reversed_lag = _lag(inspected, -inspected.v_out)
     if np.isnan(inspected.correlated) and reversed_lag is not None and abs(reversed_lag) <= 1:

@@ -32,7 +32,7 @@ from etid.signals.noise import Noise, floor, noise_of
 from etid.signals.periods import Periods
 from etid.signals.pulse_train import PulseTrain, pulse_trains
 from etid.signals.quick_looks import humming, shows_few, uneven
-from etid.signals.rounding import VISIBLE, is_coarse, step_of
+from etid.signals.rounding import COARSE, VISIBLE, is_coarse, step_of, white_variance
 
 _Key = TypeVar("_Key", bound=Hashable)
 
@@ -97,9 +97,16 @@ class Inspection:
         return joined, 0
 
     @functools.cached_property
+    @quietly()
     def step(self) -> Float[np.ndarray, "recording 2"]:
-        """Converter steps [V]; 0 if unknown."""
-        return np.array([[v.resolution or 0.0 for v in _records(one)] for one in self.recordings])
+        """Converter steps [V], stated or seen in the values; 0 if unknown."""
+        stated = [[v.resolution or 0.0 for v in _records(one)] for one in self.recordings]
+        step = np.array(stated)
+        few = (step == 0) & shows_few(self.recorded)
+        few[self.held, 0] = False  # a command has the values that it has
+        for at in map(tuple, np.argwhere(few)):
+            step[at] = step_of(self.recorded[at])
+        return step
 
     @functools.cached_property
     @quietly()
@@ -133,11 +140,9 @@ class Inspection:
         """Converter steps [V] that exceed the noise, else 0."""
         found = np.zeros(self.step.shape)
         spans = np.ptp(self.recorded_limits, axis=-1)
-        visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.recorded))
-        for row, which in np.argwhere(visible):
-            v = self.recorded[row, which]
-            step = float(self.step[row, which]) or step_of(v)
-            found[row, which] = step if is_coarse(v, step) else 0.0
+        for at in map(tuple, np.argwhere(self.step > VISIBLE * spans)):
+            step = float(self.step[at])
+            found[at] = step if is_coarse(self.recorded[at], step) else 0.0
         found[self.held, 0] = 0.0  # a command has the values that it has
         return found
 
@@ -325,7 +330,12 @@ class Inspection:
     def noise(self) -> Noise:
         """The noise of `quiet`: at least the rounding and the error of the interpolation."""
         noise = self._of_whole if self.quiet is self.recorded else self._noise(self.quiet)
-        least = floor(self.limits, self.step)[..., None] ** 2 / self._shown[1]
+        periods, samples = self._shown
+        least = floor(self.limits, self.step) ** 2
+        for at in map(tuple, np.argwhere(self.step > COARSE * self._of_whole.std(samples))):
+            rounding = white_variance(self.recorded[at], float(self.step[at]), periods)
+            least[at] = max(least[at], rounding)
+        least = least[..., None] / samples
         return noise._replace(power=np.maximum(noise.power, least))
 
     @functools.cached_property
@@ -433,8 +443,8 @@ class Inspection:
             Remark.periods_left_out: self.periods[0] < self.whole_periods[0],
             Remark.periods_shifted: np.array([shifts is not None for shifts in self.shifts]),
             Remark.coarse_converter: self.coarse.any(1),
-            # A clock is not more than 300 ppm wrong.
-            Remark.pulse_rate_counted: np.abs(self.counted / self.pulse_rate - 1) > 3e-4,
+            # A quartz is not more than 100 ppm wrong.
+            Remark.pulse_rate_counted: np.abs(self.counted / self.pulse_rate - 1) > 1e-4,
         }
         return np.asarray(sum(int(remark) * holds for remark, holds in found.items()))
 

@@ -76,7 +76,11 @@ def _misaligned(seen: "Inspection", rows: _Rows) -> _Holds:
     wrong = np.array(hopeless, bool)[rows]
     if seen.has_current:
         return np.asarray(wrong | (of_both <= 0))  # a passive load takes power
-    return np.asarray(wrong | (of_out > 1.01 * of_th) | np.isnan(seen.correlated[rows]))
+    noise = np.square(seen.sigma[rows])
+    power = np.stack([of_th, of_out], axis=1)  # with the noise
+    by_chance = np.sqrt((4 * power * noise).sum(1) / seen.recorded.shape[2])
+    more = of_out > 1.01 * of_th + faults.BY_CHANCE * by_chance
+    return np.asarray(wrong | more | np.isnan(seen.correlated[rows]))
 
 
 _VERDICTS = {

@@ -45,7 +45,9 @@ _TEXTS = {
         "The steps of the converter exceed the noise; the fit weighted the rounding errors by size."
     ),
     Remark.pulse_rate_counted: (
-        "The distance of the pulses does not match pulse_rate; the rate was measured in the record."
+        "The distance of the pulses does not match pulse_rate; the rate was measured in the "
+        "record. Or was a sample lost or recorded twice in both records? Then ± are too large, or "
+        "the fit is biased."
     ),
     Remark.circuits_close: (
         "Another circuit is likely too; the standard errors contain the difference between them."
@@ -71,10 +73,8 @@ _TEXTS = {
         "recovery after a pulse is slower than its fall; etid has no model of it."
     ),
     Remark.not_noise: (
-        "The residual is not white noise: neighbouring impedances miss alike, or another passive "
-        "circuit misses by less, or a few impedances miss by far the most (leave them out, or give "
-        "stderr). Up to 1 % of Z, as by errors of calibration, this widens the standard errors; "
-        "above, it is a misfit."
+        "The residual is not white noise. Up to 1 % of Z, as by errors of calibration, this widens "
+        "the standard errors; above, it is a misfit."
     ),
     Remark.positive_imaginary: (
         "Im Z is positive at most frequencies, as of an inductance. If the file holds -Im Z, give "

@@ -24,6 +24,7 @@ from etid.results.instrument import Effects, largest
 from etid.results.method_options import without_known
 from etid.results.posterior import tails
 from etid.results.presented import Presented
+from etid.results.residual import why_not_noise
 from etid.results.verdicts import RESULTS, Judged, counted, leaving, message
 from etid.signals.transfer import AnyArray, power
 
@@ -404,6 +405,16 @@ class Fit(Judged, Presented, HasSource[Circuit]):
         )
 
     @property
+    def remarked(self) -> list[str]:
+        """The sentences of the remarks, and where an impedance is missed; for one fit."""
+        remarks = int(self.remarks)
+        if not remarks & Remark.not_noise or self.measured is None:
+            return texts(remarks)
+        frequency, z = self.measured.frequency, self.measured.z
+        where = why_not_noise(frequency, self.circuit.response(frequency) / z - 1)
+        return [*texts(remarks), where]
+
+    @property
     def other_circuit(self) -> str:
         """A sentence if another circuit is a likelier cause of `inconsistent` than the driver."""
         support = self.support
@@ -458,6 +469,6 @@ class Fit(Judged, Presented, HasSource[Circuit]):
         known = self.measured is None or self.measured.stderr is not None  # else there is no chi2
         title += f", {quality(float(self.rrse), float(self.chi2) if known else np.nan)}"
         outside = "" if verdict == "out_of_bounds" else self.outside
-        said = [told, *self._reasons, outside, self.unstated, *texts(int(self.remarks))]
+        said = [told, *self._reasons, outside, self.unstated, *self.remarked]
         notes = list(dict.fromkeys(filter(None, said)))  # a remark may be the reason
         return Overview(title, rows, notes=notes)

@@ -75,9 +75,13 @@ def uneven(
 
 
 def shows_few(v: Float[np.ndarray, "*record time"]) -> Bool[np.ndarray, "*record"]:
-    """Whether the first 256 samples have few values, as those of a converter without noise."""
-    first = np.sort(v[..., :256], axis=-1)
-    return np.asarray(np.count_nonzero(first[..., 1:] != first[..., :-1], axis=-1) < 128)
+    """Whether 256 samples at one end have few values, as those of a converter without noise.
+
+    Where a load charges slowly, a pulse at the other end has many.
+    """
+    ends = np.sort(np.stack([v[..., :256], v[..., -256:]]), axis=-1)
+    changes = np.count_nonzero(ends[..., 1:] != ends[..., :-1], axis=-1)
+    return np.asarray((changes < 128).any(0))
 
 
 def noise_limit(sigma: Float[np.ndarray, "recording 2"]) -> Float[np.ndarray, "recording 2"]:

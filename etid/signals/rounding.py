@@ -74,6 +74,18 @@ def is_coarse(v: Float[np.ndarray, " time"], step: float) -> bool:
     return bool(step > VISIBLE * np.ptp(v) and step > COARSE * noise_before(v, step))
 
 
+def white_variance(v: Float[np.ndarray, " time"], step: float, periods: int) -> float:
+    """Variance of a sample [V²] if rounding and the noise below it were white.
+
+    Quiet parts do not show them: there the noise moves no code, or always one. Of the saw-tooth,
+    noise of σ leaves the power exp(−(2π σ / step)²), which is the same in each period.
+    """
+    noise = noise_before(v, step)
+    # A signal that rests at the middle of a code shows half of its noise.
+    left = math.exp(-((2 * math.pi * 2 * noise / step) ** 2))
+    return step**2 / 12 * (1 + (periods - 1) * left) + noise**2
+
+
 def rounding_variance(
     v: Float[np.ndarray, " time"], step: float, periods: int, samples: int
 ) -> Float[np.ndarray, " harmonic"]:

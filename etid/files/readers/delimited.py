@@ -152,7 +152,8 @@ def _refuse_texts(
                 if dialect.number(cell) is None:
                     raise RecordingError(
                         f"line {number} has {cell!r} in column {place + 1}, must be a number",
-                        remedy="Correct or remove this line",
+                        remedy="Correct it, or write NaN: without this line, all later samples "
+                        "would be at a wrong time",
                     )
 
 
