@@ -274,8 +274,8 @@ def test_a_distribution_has_every_fit():
     fits = fits_of([1.0, 1.1, 1.2, 1.3, 1.4], ["successful"] * 5)
     [line] = pictures.of_report(figures.distributions, fits).axes[0].lines
     values = np.asarray(fits.circuit.r_s)[[0, 0, 1, 2, 3, 4]] / 1e3
-    np.testing.assert_allclose(line.get_xdata(), values)
-    np.testing.assert_allclose(line.get_ydata(), [0, 20, 40, 60, 80, 100])
+    np.testing.assert_allclose(np.asarray(line.get_xdata()), values)
+    np.testing.assert_allclose(np.asarray(line.get_ydata()), [0, 20, 40, 60, 80, 100])
 
 
 def test_groups_are_in_the_order_of_their_numbers():
