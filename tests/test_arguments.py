@@ -58,6 +58,7 @@ calls = {
     "etid.select_circuit(rec, d, candidates=[etid.SkinRC])": "candidates[0]",
     "etid.select_circuit(rec, d, candidates=[etid.SkinRC(), etid.SkinRC()])": "candidates",
     "etid.bound(study)": "scene",
+    "etid.compare(fits.fits[0], fits.fits[0])": "recordings",
     "etid.bound(None)": "scene",
     "etid.predict(v, d)": "recording",
     "etid.predict(rec, None, etid.SkinRC())": "current",
@@ -92,6 +93,7 @@ for call, field in calls.items():
         print(call, type(error).__name__, getattr(error, "field", ""), error, sep="\\t")
         assert isinstance(error, ValueError), call
         assert getattr(error, "field", "method") == field, call
+        assert "\\n" not in str(error) and len(str(error)) < 300, call
     else:
         raise AssertionError(call)
 """

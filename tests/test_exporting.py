@@ -95,6 +95,13 @@ def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_pa
     assert about.items() <= schema.metadata.items()
 
 
+def test_without_pyarrow_the_error_names_the_file_of_the_user(file, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    target = tmp_path / "l.parquet"
+    with pytest.raises(etid.RecordingError, match=f"^{re.escape(str(target))}: needs the package"):
+        etid.export_fits(file, target)
+
+
 @pytest.mark.parametrize("read", [pandas.read_csv, pandas.read_parquet])
 def test_a_long_table_has_a_row_for_each_element(fits, parts, tmp_path, read):
     change = np.random.default_rng(5).normal(size=(COUNT, 4))

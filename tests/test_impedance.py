@@ -58,6 +58,7 @@ def test_what_the_data_do_not_show_is_insensitive():
     high = frequency > 3e5  # far above the corner: no R_p
     fit = etid.identify_impedance(frequency[high], z[high], stderr=2e3, throw=False)
     assert fit.verdict == "insensitive"
+    assert "Not determined: r_p." in fit.note
 
 
 def spectrum(circuit, size, seed=0):

@@ -132,3 +132,8 @@ def test_refusals_of_a_layout(tmp_path, name, text, message):
     path.write_text(text, "utf-8")
     with pytest.raises(RecordingError, match=message):
         read_layout(path)
+
+
+def test_fits_without_electrodes_have_no_map():
+    with pytest.raises(ValueError, match="a fit has no label electrode"):
+        figure_of(pictures.fits(), map="r_p")

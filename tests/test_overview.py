@@ -102,7 +102,9 @@ def found_driver():
 def changed():
     """A fit of a load that changed."""
     moved = np.array([0.01, -0.2, 0.003, 0.0001])
-    return dataclasses.replace(fit("changed"), change=moved, change_stderr=0.1 * abs(moved))
+    stderr = 0.1 * abs(moved)
+    stderr[2] = 8e3  # not determined
+    return dataclasses.replace(fit("changed"), change=moved, change_stderr=stderr)
 
 
 SHOWN = {
@@ -111,7 +113,7 @@ SHOWN = {
         ["SkinRC: successful in 7 steps", "r_s 33.40 ± 0.10 kΩ", "c_p 0.1200 ± 0.0010 nF"],
     ),
     "failed fit": (lambda: fit("misfit"), ["SkinRC: misfit", "misses the recording", "chi2 is 1"]),
-    "changed fit": (changed, ["During the record: r_s +1 ± 0.1 %, r_p -20 ± 2 %"]),
+    "changed fit": (changed, ["During the record: r_s +1 ± 0.1 %, r_p -20 ± 2 %, amplitude +0.01"]),
     "driver with findings": (
         found_driver,
         ["r_load 98.8 kΩ is +2.02 ± 0.1 % off", "misfit", "misses the recording"],
@@ -121,7 +123,7 @@ SHOWN = {
     "fits": (fits, ["3 fits of SkinRC: 2 successful, 1 misfit", "s1 <b> 2/2 33.40 ± 0.10"]),
     "circuit": (lambda: DRY, ["SkinRC", "186 kΩ", "0.12 nF"]),
     "circuits": (lambda: fits().circuit, ["SkinRC", "186 … 186 kΩ"]),
-    "stderr": (lambda: fit().stderr, ["SkinRC", "0.1 kΩ"]),
+    "stderr": (lambda: fit().stderr, ["SkinRC", "100 Ω"]),
     "scene": (
         lambda: etid.scenes.paper_dry(),
         [
@@ -265,6 +267,9 @@ def test_what_jax_traces_or_maps_can_be_shown(make):
         (5.5, 0.1, "ohm", "5.50 ± 0.10 Ω"),
         (33.4e3, 33.4e-6, "ohm", "33.4 ± 0 kΩ"),  # a fixed element
         (22e6, 1e6, "ohm", "22.0 ± 1.0 MΩ"),
+        (200.02, 0.11, "ohm", "200.02 ± 0.11 Ω"),  # not 0.20002 kΩ
+        (0.99978, 4e-4, "ohm", "0.99978 ± 0.00040 Ω"),  # not 999.78 mΩ
+        (9.9956e-6, 4e-9, "farad", "9.9956 ± 0.0040 µF"),
         (0.12e-9, 4e-13, "farad", "0.12000 ± 0.00040 nF"),
         (47e-6, 1e-6, "farad", "47.0 ± 1.0 µF"),
         (0.4e-12, 1e-14, "farad", "400 ± 10 fF"),

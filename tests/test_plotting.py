@@ -19,6 +19,7 @@ from etid.plotting.by_frequency import sample_std
 from etid.plotting.pulses import pulse
 from etid.plotting.style import COLOURS, RED, VIOLET, new_figure
 from etid.recordings.preflight import Inspected
+from etid.results.verdicts import verdicts_of
 from tests import pictures
 
 EXPECTED = json.loads(pictures.DESCRIBED.read_text())
@@ -189,6 +190,30 @@ def test_fits_are_by_subject_unusable_ones_hollow_and_approximate_ones_of_a_colo
     (bars,) = axis.containers[-1][2]
     lengths = [np.ptp(segment[:, 1]) for segment in bars.get_segments()]
     np.testing.assert_allclose(lengths, [2e-3 * one["r_s_between"] for one in groups])
+
+
+def test_a_fit_beside_fits_without_elements_is_at_its_tick():
+    of = pictures.fits().take(np.arange(3))
+    nothing = np.where([[True], [False], [False]], of.circuit.values(), np.nan)
+    bad = dataclasses.replace(
+        of.fit,
+        circuit=etid.SkinRC.of_fit(nothing.T),
+        result=verdicts_of(np.array(["successful", "flat", "misaligned"])),
+    )
+    labels = dict.fromkeys(("subject", "condition"), np.full(3, "", object))
+    figure = figure_of(dataclasses.replace(of, fit=bad, labels=labels))
+    axis = figure.axes[-1]
+    drawn = np.concatenate([np.asarray(line.get_xdata()) for line in axis.lines])
+    assert set(drawn.tolist()) == {0.0}
+    assert axis.get_xlim() == (-0.5, 0.5)
+    assert not figure.legends  # nothing unusable is drawn
+
+
+def test_a_nyquist_plot_has_little_room_below_zero():
+    nyquist = pictures.drawn("measured_impedance").axes[0]
+    nyquist.figure.draw_without_rendering()
+    low, high = nyquist.get_ylim()
+    assert 0 < -low < 0.2 * high
 
 
 def test_fits_are_by_any_two_labels():

@@ -5,7 +5,7 @@ import pytest
 import etid
 from benchmarks.specimens import study_fits
 from etid.recordings.recording import RecordingError
-from etid.recordings.replacing import replace_text, replacing
+from etid.recordings.replacing import claimed, replace_text, replacing
 
 
 def test_a_file_is_as_it_was_until_all_is_written(tmp_path):
@@ -30,6 +30,16 @@ def test_a_link_stays_and_the_file_behind_it_is_written(tmp_path, existing):
     assert link.is_symlink()
     assert behind.read_text() == "after"
     assert list(behind.parent.iterdir()) == [behind]
+
+
+@pytest.mark.parametrize("write", [claimed, replacing])
+def test_an_error_names_the_file_of_the_user_alone(tmp_path, write):
+    (tmp_path / "folder").touch()
+    target = tmp_path / "folder" / "fits.csv"  # no file can be there
+    with pytest.raises(RecordingError) as refused, write(target) as partial:
+        partial.write_text("")
+    assert str(refused.value).startswith(f"{target}: cannot be written (")
+    assert str(refused.value).count("fits") == 1
 
 
 def test_two_processes_may_write_one_file_at_once(tmp_path):

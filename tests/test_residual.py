@@ -185,5 +185,5 @@ def test_what_has_no_residual_says_why(study, driver, fit):
     with pytest.raises(ValueError, match="batch"):
         fits.fit.residual(study["typical/dry/01"], driver)
     failed = dataclasses.replace(fit, circuit=etid.SkinRC.of_fit([np.nan, 1.0, 1.0]))
-    with pytest.raises(ValueError, match="no elements"):
+    with pytest.raises(ValueError, match=r"no elements.*: SkinRC: [^\n]*$"):
         failed.residual(study["typical/dry/01"], driver)

@@ -149,9 +149,12 @@ def test_many_spectra_are_a_table_and_a_bad_one_costs_itself():
         assert "'alone': has 1 array" in fits.notes[6]
         assert ("supports SkinLayers better" in fits.notes[7]) == (circuit == "auto")
         assert fits.labels["subject"][0] == "s00"
-    rich = etid.identify_impedances({"bad": (F, F[1:]), "layers": (F, layers)}, circuit="auto")
+    rich = etid.identify_impedances(
+        {"bad": (F, F[1:]), "nan": (F, np.nan * F), "layers": (F, layers)}, circuit="auto"
+    )
     assert type(rich.circuit).__name__ == "SkinLayers"
-    assert rich.verdicts.tolist() == ["unreadable", "successful"]
+    assert rich.verdicts.tolist() == ["unreadable", "nonfinite_samples", "successful"]
+    assert "bad: unreadable. frequency has shape" in str(rich)
     alone = etid.identify_impedance(F, spectra["s02/dry"][1])
     of = etid.identify_impedances(spectra)["s02/dry"]
     np.testing.assert_array_equal(of.circuit.values(), alone.circuit.values())

@@ -269,6 +269,24 @@ def test_the_variation_between_subjects_is_relative_to_the_median_that_the_table
         assert one.parts["between subjects"] * one.median == pytest.approx(between)
 
 
+def test_a_distribution_has_every_fit():
+    """Of five fits the quantile at 3/5 was the fourth, for 3/5 is 0.6000000000000001."""
+    fits = fits_of([1.0, 1.1, 1.2, 1.3, 1.4], ["successful"] * 5)
+    [line] = pictures.of_report(figures.distributions, fits).axes[0].lines
+    values = np.asarray(fits.circuit.r_s)[[0, 0, 1, 2, 3, 4]] / 1e3
+    np.testing.assert_allclose(np.asarray(line.get_xdata()), values)
+    np.testing.assert_allclose(np.asarray(line.get_ydata()), [0, 20, 40, 60, 80, 100])
+
+
+def test_groups_are_in_the_order_of_their_numbers():
+    electrodes = np.array(["E12", "E3", "E7"])
+    fits = fits_of([1.0, 2.0, 3.0], ["successful"] * 3, electrode=electrodes, subject=electrodes)
+    assert [row["electrode"] for row in fits.summary("electrode")] == ["E3", "E7", "E12"]
+    for figure in (etid.plotting.figure_of(fits), pictures.of_report(figures.by_subject, fits)):
+        ticks = figure.axes[-1].get_xticklabels()
+        assert [tick.get_text() for tick in ticks] == ["E3", "E7", "E12"]
+
+
 def test_figures_of_a_report_are_whole_and_clear():
     fits = fits_of(
         np.linspace(1.0, 1.3, 12), ["successful"] * 12, subject=np.repeat(["a", "b"], 6),

@@ -42,8 +42,8 @@ PREFIXES = {
 def scaled(unit: str, value: float = np.nan, error: float = np.nan) -> tuple[float, str]:
     """Size [SI] and symbol of the unit in which a value is shown, or its error if this is larger.
 
-    It is that of `DISPLAY`, or one with another prefix if the number would be below 0.1 or above
-    10 000.
+    It is that of `DISPLAY` for numbers from 0.1 to 1000, else one with another prefix for numbers
+    from 1 on. Below 1 it has no prefix where one is not needed: 200 Ω, but 0.12 nF.
 
     Args:
         unit: SI unit, a key of `DISPLAY`.
@@ -51,9 +51,10 @@ def scaled(unit: str, value: float = np.nan, error: float = np.nan) -> tuple[flo
         error: Its standard error in the SI unit; NaN if there is none.
     """
     size = max(abs(value), error) if np.isfinite(error) else abs(value)
-    shown = size / DISPLAY[unit][0]
-    usual = not (np.isfinite(shown) and shown > 0) or 0.0999 <= shown < 1e4
-    if usual or unit not in SYMBOLS:
+    size /= 0.999  # 999.8 mΩ are 1 Ω
+    usual = DISPLAY[unit][0]
+    known = np.isfinite(size) and size > 0 and unit in SYMBOLS
+    if not known or (1.0 if usual > 1 else 0.1) <= size / usual < 1e3:
         return DISPLAY[unit]
     power = int(np.clip(3 * np.floor(np.log10(size) / 3), min(PREFIXES), max(PREFIXES)))
     return 10.0**power, PREFIXES[power] + SYMBOLS[unit]

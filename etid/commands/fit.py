@@ -3,6 +3,7 @@
 import argparse
 import concurrent.futures
 import contextlib
+import dataclasses
 import pathlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -243,7 +244,7 @@ def _executor(arguments: argparse.Namespace) -> Iterator[concurrent.futures.Exec
 def _summary(outcome: StudyFits) -> str:
     """Text for people: the fits and drivers, and the recordings that cannot be used."""
     fits = outcome.fits
-    lines = [str(outcome)]
+    lines = [dataclasses.replace(fits._medians(), then=(outcome._drivers(),)).text()]
     if len(fits) == 1 and fits.fit.usable.all():
         lines += ["", str(fits[0])]
     failed = np.flatnonzero(~fits.fit.usable)

@@ -17,7 +17,7 @@ from etid.circuits.netlist import circuit_string, netlist
 from etid.files.channel import listed
 from etid.precision import in_float64
 from etid.recordings import limits
-from etid.recordings.errors import RecordingError, optional
+from etid.recordings.errors import RecordingError, located, optional
 from etid.recordings.replacing import replace_text, replacing
 from etid.recordings.untrusted import attribute, translated
 from etid.results.fit import Fit, Limited
@@ -63,7 +63,11 @@ def export_fits(
         raise ValueError(
             f"{os.fspath(target)}: fits are exported as {' or '.join(TABLES)}, not {suffix!r}"
         )
-    with opened_table(source, SCHEMA, VERSION) as table, replacing(target) as partial:
+    with (
+        opened_table(source, SCHEMA, VERSION) as table,
+        located(os.fspath(target)),
+        replacing(target) as partial,
+    ):
         names = _elements(table)
         columns = _columns(table, names)
         if not all:
@@ -159,8 +163,8 @@ def _cell(value: str | float | int) -> str | float | int:
 def _parquet(
     parts: Iterator[_Part], units: _Units, about: dict[str, str], path: pathlib.Path
 ) -> None:
-    pyarrow = optional("pyarrow", "parquet", str(path))
-    parquet = optional("pyarrow.parquet", "parquet", str(path), "pyarrow")
+    pyarrow = optional("pyarrow", "parquet")
+    parquet = optional("pyarrow.parquet", "parquet", package="pyarrow")
     fields = []
     first = next(parts)
     for name, column in first.items():

@@ -10,6 +10,7 @@ from typing import Any, cast
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.display import several
 from etid.circuits.lookup import circuit
+from etid.circuits.overview import Overviewed
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import Known
 from etid.recordings.errors import not_recorded
@@ -53,7 +54,9 @@ def require(field: str, value: object, kind: type, remedy: str = "") -> None:
         what = f"the class {value.__name__}"
         remedy = f"Pass an instance, {value.__name__}()" if kind is AbstractCircuit else remedy
     else:
-        what = "None" if value is None else f"{type(value).__name__} {reprlib.repr(value)}"
+        what = "None" if value is None else type(value).__name__
+        if not isinstance(value, Overviewed | None):  # a print has many lines
+            what = f"{what} {reprlib.repr(value)}"
     raise RecordingError(
         f"is {what}, must be of type {kind.__name__}",
         field=field,

@@ -305,18 +305,19 @@ def fit_file(
                 map(os.path.abspath, sources)
             )  # another process may be in another folder
             task = functools.partial(_fit_elsewhere, places, stamps, options, PART)
-        identified = {}
+        now: dict[int, StudyFits] = {}  # a file holds less of a fit
         done = min(count, (len(numbers) - len(left)) * PART)
         with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:
             for number, found in _results(task, left, executor):
-                dataclasses.replace(found, settings=settings).write(parts.path(number))
-                identified |= found.drivers
+                now[number] = dataclasses.replace(found, settings=settings)
+                now[number].write(parts.path(number))
                 bar.update(len(found.fits))
         whole = StudyFits.concatenate(
-            parts.read(number, type(options.circuit)) for number in numbers
+            now.get(number) or parts.read(number, type(options.circuit)) for number in numbers
         )
         whole.write(target)
         shutil.rmtree(parts.folder)
+        identified = {paths: of for found in now.values() for paths, of in found.drivers.items()}
         return dataclasses.replace(whole, drivers={**whole.drivers, **identified})
 
 

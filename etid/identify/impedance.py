@@ -19,7 +19,7 @@ from etid.estimators.element_limits import checked_limits
 from etid.estimators.element_prior import checked
 from etid.estimators.lanes import stacked
 from etid.identify.arguments import bounds_of, known_elements
-from etid.identify.kramers_kronig import checked_spectrum
+from etid.identify.kramers_kronig import NotFinite, checked_spectrum
 from etid.identify.options import Circuit, Interval, Options, candidates_of
 from etid.identify.planning import Refusal, failed_fit
 from etid.identify.spectrum import chain_of
@@ -146,7 +146,10 @@ def identify_impedances(
             measured[row] = one = _measured(arrays)
             found.append(_choice(one, options))
         except (ValueError, TypeError) as error:
-            found.append(Refusal.of(RecordingError(str(error), path=path)))
+            refusal = Refusal.of(RecordingError(str(error), path=path))
+            if isinstance(error, NotFinite):
+                refusal = refusal._replace(name="nonfinite_samples")
+            found.append(refusal)
     chosen = [one for one in found if isinstance(one, Selection)]
     number = common(chosen, options.circuits) if chosen else 0
     alone = dataclasses.replace(options, circuits=(options.circuits[number],))

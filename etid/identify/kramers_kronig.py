@@ -32,6 +32,10 @@ _SPARSE = 3.0  # least frequencies per decade
 FAIL = 0.01  # relative residual above which a measurement without known errors is suspect
 
 
+class NotFinite(ValueError):
+    """An impedance is missing or not finite."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class KramersKronig(Overviewed):
     """The residuals of a Kramers-Kronig test.
@@ -154,8 +158,9 @@ def checked_spectrum(
     """Frequencies, impedances and standard errors of a caller, one for each frequency.
 
     Raises:
-        ValueError: The shapes differ, an impedance is missing or not finite, a frequency or a
-            standard error is not positive, or without standard errors an impedance is 0.
+        ValueError: The shapes differ, a frequency or a standard error is not positive, or without
+            standard errors an impedance is 0.
+        NotFinite: An impedance is missing or not finite.
     """
     f, z = _numbers("frequency", frequency, float), _numbers("impedance", impedance, complex)
     sigma = None if stderr is None else _numbers("stderr", stderr, float)
@@ -173,7 +178,7 @@ def checked_spectrum(
             raise ValueError(f"{name} must be finite and > 0 everywhere")
     if not np.isfinite(z).all():
         bad = several(int(np.count_nonzero(~np.isfinite(z))), "impedance")
-        raise ValueError(f"{bad} of {z.size} missing or not finite; fit the others")
+        raise NotFinite(f"{bad} of {z.size} missing or not finite; fit the others")
     if sigma is None and not z.all():
         raise ValueError("impedance is 0 somewhere; leave it out, or give stderr")
     return f, z, None if sigma is None else np.broadcast_to(sigma, f.shape)

@@ -342,7 +342,7 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
 
 
 def _undetermined(fit: Fit) -> ValueError:
-    return ValueError(f"the recording does not determine all elements of {fit}")
+    return ValueError(f"the recording does not determine all elements: {fit._overview().title}")
 
 
 @in_float64

@@ -87,7 +87,9 @@ def residual(fit: Fit, recording: Recording | None, driver: Driver | None) -> Re
     require("fit", fit, Fit)
     fit.refuse_batch()
     if not np.isfinite(np.asarray(fit.circuit.values())).all():
-        raise ValueError(f"this fit has no elements, so that nothing is predicted: {fit}")
+        raise ValueError(
+            f"this fit has no elements, so that nothing is predicted: {fit._overview().title}"
+        )
     recording, driver = fit.source_or_own(recording, driver)
     name = f"{type(fit.circuit).__name__} ({fit.verdict})"
     if recording is None and fit.measured is not None:

@@ -27,6 +27,7 @@ from etid.plotting.style import (
     symbol,
     titled,
 )
+from etid.recordings.contents import ranked
 from etid.recordings.fields import LABELS, check_names
 from etid.results.fits import Fits
 from etid.results.posterior import Posterior, Profile
@@ -52,14 +53,15 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     units = fits.circuit.units()
     axes = canvas(len(units), 1, (7.5, 0.6 + 2.2 * len(units)), sharex=True).ravel()
     labels, second = (fits.labels[name].astype(str) for name in by)
-    groups, place = np.unique(labels, return_inverse=True)
+    groups, place = ranked(labels)
     series = np.unique(second).tolist()
     width = 0.8 / len(series)
     beside = {label: (i + 0.5) * width - 0.4 for i, label in enumerate(series)}
     x = place + np.array([beside[label] for label in second.tolist()])
+    has = np.isfinite(np.asarray(fits.circuit.values())).all(-1)
     for label in series:
         for group in range(groups.size):
-            (trials,) = np.nonzero((second == label) & (place == group))
+            (trials,) = np.nonzero((second == label) & (place == group) & has)
             if trials.size > 1:
                 x[trials] += width * np.linspace(-0.35, 0.35, trials.size)
     # Fewer fits have no variation.
@@ -68,6 +70,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     good, inexact = fits.fit.usable, fits.verdicts == "approximate"
     room = len(fits) <= 40 and axes[0].figure.get_figwidth() > 5
     beside_points = _distinct(fits, by) if room else ""
+    hollow = False
     for axis, (name, unit) in zip(axes, units.items(), strict=True):
         scale = DISPLAY[unit][0]
         values = np.asarray(getattr(fits.circuit, name)) / scale
@@ -87,6 +90,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
         )
         axis.errorbar(middle, medians, between, fmt="_", ms=14, lw=2.5, color=INK, zorder=4)
         axis.set_yscale("log")
+        axis.set_xlim(-0.5, groups.size - 0.5)
         shown = known
         if (good & known).any():  # an undetermined element may lie decades away
             low, high = values[good & known].min() / 1.4, values[good & known].max() * 1.4
@@ -94,6 +98,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
             axis.set_ylim(low, high)
             shown = known & (values > low) & (values < high)
         plain_ticks(axis.yaxis)
+        hollow |= bool((shown & ~good).any())
         hidden = {"unusable outside": known & ~shown, "without elements": ~known}
         told = [f"{of.sum()} {where}" for where, of in hidden.items() if of.any()]
         sizes = (errors / values)[good & known & (errors > 0)]
@@ -121,7 +126,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     entries = _series(list(map(plain, series)))
     if inexact.any():
         entries.append(key("approximate", "o", VIOLET))
-    if not good.all():
+    if hollow:
         entries.append(key("unusable", "o", hollow=True))
     legend(axes, entries)
     bars = "bars: one standard error"

@@ -39,7 +39,7 @@ def draw_impedance(
 ) -> np.ndarray:
     """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
     if not listed(fit):
-        axes = canvas.three((7.5, 4.6))
+        axes = canvas.three((7.5, 4.6), wide=True)
         for axis in axes:
             without_elements(axis)
         judged(axes[0], recording.path, fit)
@@ -67,7 +67,7 @@ def _diagrams(
     stderr: Float[np.ndarray, " point"] | None,
 ) -> np.ndarray:
     """Nyquist and Bode diagrams of measured points, with standard errors of ln Z, and of a fit."""
-    nyquist, magnitude, phase = axes = canvas.three((7.5, 4.6))
+    nyquist, magnitude, phase = axes = canvas.three((7.5, 4.6), wide=True)
     unit, ohms = scaled("ohm", float(np.median(np.abs(z))))
     hertz = (1.0, "Hz") if frequency.min() < SLOW else (1e3, "kHz")
     bode = Bode(magnitude, phase, (unit, ohms), hertz)
@@ -83,7 +83,10 @@ def _diagrams(
     size = None if stderr is None else 2 * stderr * np.abs(z) / unit
     nyquist.errorbar(np.real(z) / unit, -np.imag(z) / unit, size, size, fmt="o", **point)
     nyquist.set(xlabel=f"Re Z [{ohms}]", ylabel=f"-Im Z [{ohms}]")
-    nyquist.set_aspect("equal", adjustable="datalim")
+    (left, right), (low, high) = nyquist.get_xlim(), nyquist.get_ylim()
+    nyquist.set_ylim(low, max(high, low + (right - left) / 3))  # of a resistor, too
+    nyquist.set_xlim(left, max(right, left + (high - low) / 3))
+    nyquist.set_aspect("equal", anchor="W")
     bode.points(frequency, z, stderr, **point)
     bode.frame(z)
     for axis in (magnitude, phase):

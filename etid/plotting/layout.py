@@ -73,6 +73,11 @@ class Layout(Overviewed):
         """
         rows = {name: row for row, name in enumerate(self.electrodes)}
         for name in names:
+            if not str(name):
+                raise ValueError(
+                    "a fit has no label electrode, so it has no place on a map; give each "
+                    "recording its electrode"
+                )
             if str(name) not in rows:
                 raise ValueError(
                     f"electrode {str(name)!r} is not in the layout, which has "

@@ -186,7 +186,7 @@ class Scan:
                 )
             present = list(group.attrs)
             near = "kind" in present or near_miss("kind", present)
-            names = sorted(group, key=_natural)
+            names = sorted(group, key=natural)
             if near or "v_out" in names:
                 return self._inspect(group, path, names, present)
             for name in names:
@@ -406,9 +406,16 @@ class Scan:
         self._report(path, "calibration", f"{calibration!r} {what}", remedy)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def natural(name: str) -> list[tuple[int, str]]:
     """Sorting key that orders digits by their number: 2 before 10."""
     parts = re.split(r"([0-9]+)", name)
     # Python does not convert numbers of more than 4300 digits.
     numbers = (part.isdecimal() and len(part) < 1000 for part in parts)
     return [(int(p), "") if whole else (-1, p) for p, whole in zip(parts, numbers, strict=True)]
+
+
+def ranked(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The different names, 2 before 10, and for each name its place among them."""
+    found, place = np.unique(names, return_inverse=True)
+    order = np.array(sorted(range(found.size), key=lambda row: natural(str(found[row]))), int)
+    return found[order], np.argsort(order)[place]

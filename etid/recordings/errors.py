@@ -131,7 +131,7 @@ def install(extra: str) -> str:
     return f"pip install 'etid[{extra}]' (in a clone: '.[{extra}]')"
 
 
-def optional(module: str, extra: str, file: str, package: str = "") -> Any:
+def optional(module: str, extra: str, file: str = "", package: str = "") -> Any:
     """A module of a package that only users of one format need.
 
     Args:

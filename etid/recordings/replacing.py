@@ -33,7 +33,7 @@ def check_ending(path: str | os.PathLike[str], endings: tuple[str, ...] = HDF5) 
 def unwritable(path: str | os.PathLike[str], error: OSError) -> RecordingError:
     """The error for a file that the operating system does not let us write."""
     return RecordingError(
-        f"cannot be written ({error})",
+        f"cannot be written ({error.strerror or error})",
         file=os.fspath(path),
         remedy="Check folder, permissions and disk space",
     )

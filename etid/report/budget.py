@@ -1,6 +1,7 @@
 """The uncertainty budget of a typical recording: what to buy or to record next."""
 
 import contextlib
+import dataclasses
 
 import numpy as np
 
@@ -42,11 +43,10 @@ def budgets(found: StudyFits, study: Study | None) -> list[Section]:
         "What stands behind “if” was not stated: such an error of the instrument would change the "
         "elements by this size, and is in no standard error."
     )
+    budget = dataclasses.replace(budget, names=tuple(map(as_symbol, budget.names)))
     text = " ".join(filter(None, [text, budget.largest]))
     rows_shown = tuple(map(tuple, budget._overview().rows))
-    return [
-        Section("Budget", text, (Table(("source", *map(as_symbol, budget.names)), rows_shown),))
-    ]
+    return [Section("Budget", text, (Table(("source", *budget.names), rows_shown),))]
 
 
 def _of(found: StudyFits, study: Study, row: int, path: str) -> Budget | None:

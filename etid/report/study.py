@@ -26,7 +26,7 @@ from etid.report.methods import methods_section, succeeded, words
 from etid.report.waveforms import find, relative_stderr, waveforms
 from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits
-from etid.results.verdicts import message, own_part
+from etid.results.verdicts import USABLE, message, own_part
 
 
 @np.errstate(all="ignore")  # a fit that failed may hold any number
@@ -136,7 +136,7 @@ def summary(found: StudyFits) -> str:
 
 
 def _verdicts(fits: Fits) -> Section:
-    text = "Every recording ends in a verdict; successful is the only good one."
+    text = f"Every recording ends in a verdict; {' and '.join(USABLE)} ones can be used."
     return Section("Verdicts", text, (study_tables.verdicts(fits),))
 
 

@@ -23,6 +23,7 @@ from etid.circuits.display import (
 )
 from etid.recordings.fields import LABELS
 from etid.report.html import Table
+from etid.report.methods import words
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.fits import Fits
 from etid.results.verdicts import message, own_part
@@ -78,7 +79,7 @@ def drivers(
                 first_of(paths, 4),
                 ", ".join(f"{r / 1e3:.6g}" for r in resistors),
                 str(driver.order),
-                driver.method,
+                words(driver.method),
                 driver.verdict,
                 significant(100 * float(driver.rrse)),
                 significant(float(driver.chi2), 3),

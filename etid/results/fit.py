@@ -379,15 +379,23 @@ class Fit(Judged, Presented, HasSource[Circuit]):
 
     @property
     def changes(self) -> str:
-        """A sentence on the change of each element and of the amplitude; for one fit."""
+        """A sentence on the changes of elements and amplitude that are determined; for one fit."""
         if self.change is None or self.change_stderr is None:
             return ""
-        return "During the record: " + ", ".join(
+        names = *self.circuit.names(), "amplitude"
+        known = [
             f"{name} {_signed(100 * float(size))} ± {rounded(100 * float(error), 1)} %"
-            for name, size, error in zip(
-                (*self.circuit.names(), "amplitude"), self.change, self.change_stderr, strict=True
-            )
-        )
+            for name, size, error in zip(names, self.change, self.change_stderr, strict=True)
+            if error < 1  # else the record does not determine it
+        ]
+        return f"During the record: {', '.join(known)}." if known else ""
+
+    @property
+    def undetermined(self) -> str:
+        """A sentence that names the elements whose standard error is not below their value."""
+        sure = np.asarray(self.stderr.values()) < np.asarray(self.circuit.values())
+        names = [name for name, one in zip(self.circuit.names(), sure, strict=True) if not one]
+        return f"Not determined: {' and '.join(names)}." if names else ""
 
     @property
     def missed(self) -> str:
@@ -447,6 +455,7 @@ class Fit(Judged, Presented, HasSource[Circuit]):
     @property
     def _reasons(self) -> list[str]:
         said = {"changed": "changes", "misfit": "missed", "out_of_bounds": "outside"}
+        said |= dict.fromkeys(("insensitive", "resolution"), "undetermined")
         own = getattr(self, said.get(self.verdict, ""), "")
         doubtful = self.verdict in ("misfit", "inconsistent", "max_steps_reached")
         doubt = "Is what was told right, and in SI units?" if doubtful and self._told[1] else ""

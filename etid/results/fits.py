@@ -14,6 +14,7 @@ from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.circuits.display import heading, per_cent, plus_minus, scaled, several
 from etid.circuits.lookup import class_path
 from etid.circuits.overview import Overview, Overviewed
+from etid.recordings.contents import natural
 from etid.recordings.errors import install
 from etid.recordings.fields import DESCRIBING, Label, check_names, wanted_labels
 from etid.results.data import with_data
@@ -29,8 +30,9 @@ from etid.results.fits_columns import (
 )
 from etid.results.hdf5_table import Table, opened_table, write_table
 from etid.results.instrument import Effects
-from etid.results.verdicts import counted, counts, left
+from etid.results.verdicts import counted, counts, left, message, own_part
 
+FEW = 5  # unusable fits that are explained
 AND = " + "  # between the names of estimators
 
 
@@ -255,8 +257,8 @@ class Fits(Overviewed, Generic[Circuit]):
             *by: Labels that define the groups. Without a label, all fits are one group.
 
         Returns:
-            A row for each group, sorted by the labels. Numbers are in SI units; they are NaN if the
-            group has no usable fit.
+            A row for each group, sorted by the labels, 2 before 10. Numbers are in SI units; they
+            are NaN if the group has no usable fit.
 
         Raises:
             RecordingError: A label does not exist.
@@ -278,8 +280,26 @@ class Fits(Overviewed, Generic[Circuit]):
             and len(set(zip(groups, self.labels[name].tolist(), strict=True))) > several
         ]
 
-    @np.errstate(over="ignore", invalid="ignore")  # of a damaged file
     def _overview(self) -> Overview:
+        whole = self._medians()
+        return dataclasses.replace(whole, notes=[*whole.notes, *self._unusable()])
+
+    def _unusable(self) -> list[str]:
+        """Path, verdict and first reason of the first `FEW` unusable fits."""
+        failed = np.flatnonzero(~self.fit.usable)
+        lines = []
+        for row in failed[:FEW].tolist():
+            verdict = str(self.verdicts[row])
+            why = own_part(verdict, str(self.notes[row])) or message(verdict, self.fit.of_impedance)
+            path = str(self.labels["path"][row])
+            why = why.removeprefix(f"{path!r}: ").partition(". ")[0].rstrip(".")
+            lines.append(f"{path or f'fit {row}'}: {verdict}. {why}.")
+        more = failed.size - len(lines)
+        return [*lines, *[f"… and {more} more unusable; fits.notes has all reasons"] * (more > 0)]
+
+    @np.errstate(over="ignore", invalid="ignore")  # of a damaged file
+    def _medians(self) -> Overview:
+        """Title and table, without what is said of unusable fits."""
         units, groups = self.circuit.units(), self.summary("subject", "condition")
         rows, usable = [], self.usable().circuit
         middle = {
@@ -372,7 +392,7 @@ def _summary(fits: Fits, by: Sequence[str]) -> list[dict[str, Any]]:
     check_names(dict.fromkeys(by), LABELS, "label")
     columns = [map(str, fits.labels[name].tolist()) for name in by]
     keys = list(zip(*columns, strict=True)) if by else [()] * len(fits)
-    groups = sorted(set(keys))
+    groups = sorted(set(keys), key=lambda key: [natural(label) for label in key])
     number = {key: i for i, key in enumerate(groups)}
     place = np.array([number[key] for key in keys], int)
     good = fits.usable()

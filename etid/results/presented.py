@@ -110,5 +110,5 @@ def _recording(fit: "Fit") -> str:
     """Path and labels of the recording, as far as known."""
     told = fit.described
     labels = [f"{name} {told[name]}" for name in LABELS if name != "path" and told.get(name)]
-    named = [repr(told["path"])] if told.get("path") else []
+    named = [repr(str(told["path"]))] if told.get("path") else []
     return f"Recording: {', '.join(itertools.chain(named, labels))}" if named or labels else ""

@@ -145,6 +145,9 @@ class StudyFits(Overviewed):
         return cls(fits, drivers, failures, parts[0].settings)
 
     def _overview(self) -> Overview:
+        return dataclasses.replace(self.fits._overview(), then=(self._drivers(),))
+
+    def _drivers(self) -> Overview:
         rows = [
             (
                 ", ".join(paths),
@@ -159,14 +162,13 @@ class StudyFits(Overviewed):
             for paths, driver in self.drivers.items()
             if not driver.usable
         }
-        drivers = Overview(
+        return Overview(
             f"{several(len(self.drivers) + len(self.failures), 'driver')}, {len(failed)} failed",
             rows,
             ("calibrations", "order", "verdict", "chi2"),
             [f"{', '.join(paths)}: {text}" for paths, text in list(failed.items())[:ROWS]],
             count=len(self.drivers),
         )
-        return dataclasses.replace(self.fits._overview(), then=(drivers,))
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the fits, the drivers and the settings to an HDF5 file.

@@ -268,6 +268,7 @@ _OF_SPECTRUM = {
         "Impedance and bounds contradict each other: without its bounds an element lies more than "
         "three standard errors outside. Correct the bounds, or fit another circuit."
     ),
+    "nonfinite_samples": "The impedance contains NaN or infinite numbers. Leave them out.",
     "unreadable": "These arrays are no impedance; the note says why.",
 }
 
