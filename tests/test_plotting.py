@@ -211,7 +211,7 @@ def test_a_fit_beside_fits_without_elements_is_at_its_tick():
 
 def test_a_nyquist_plot_has_little_room_below_zero():
     nyquist = pictures.drawn("measured_impedance").axes[0]
-    nyquist.figure.draw_without_rendering()
+    nyquist.figure.canvas.draw()
     low, high = nyquist.get_ylim()
     assert 0 < -low < 0.2 * high
 
