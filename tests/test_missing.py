@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.signals.missing import unmasked
+from etid.precision import unmasked
 from tests.display.test_online import TEN, quiet, tracker_of
 
 RATES: dict[str, Any] = {"sample_rate": 200e3, "pulse_rate": 60.0}

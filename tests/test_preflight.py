@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from benchmarks.spice import imported
 from etid.identify.planning import explained
 from etid.recordings.causes import why_misaligned
+from etid.recordings.faults import SHORTEST
 from etid.recordings.preflight import Inspected
 from etid.recordings.preflight import preflight as of_inspected
-from etid.recordings.refusals import SHORTEST
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
 

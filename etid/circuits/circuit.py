@@ -33,8 +33,7 @@ from etid.circuits.elements import (
 )
 from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
 from etid.circuits.overview import Overview, Overviewed, element_rows
-from etid.precision import Module, in_float64, namespace
-from etid.signals.missing import unmasked
+from etid.precision import Module, in_float64, namespace, unmasked
 from etid.signals.transfer import AnyArray, frequency_variable, widened
 
 _Same = TypeVar("_Same", bound="AbstractCircuit")

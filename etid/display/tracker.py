@@ -74,7 +74,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import circuit_of, number_of, require
 from etid.identify.fitting import known_at
 from etid.identify.planning import explained
-from etid.precision import Kept, in_float64, untraced
+from etid.precision import Kept, in_float64, unmasked, untraced
 from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
@@ -83,7 +83,6 @@ from etid.results.fit import IdentificationError
 from etid.results.fits import Fits
 from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
-from etid.signals.missing import unmasked
 
 # A window has faults that a record of several periods has not, and others have other remedies.
 NOTES = {

@@ -22,8 +22,7 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.display import per_cent, rounded, several
 from etid.circuits.overview import Overview, Overviewed
-from etid.precision import in_float64
-from etid.signals.missing import unmasked
+from etid.precision import in_float64, unmasked
 
 MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
 EXACT = 1e-4  # relative residual that is as good as none

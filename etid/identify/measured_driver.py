@@ -20,14 +20,13 @@ from etid.circuits.discrete import Filter
 from etid.circuits.display import several
 from etid.identify.arguments import LARGEST_ORDER, number_of
 from etid.likelihood.noise import misses
-from etid.precision import array_function, in_float64
+from etid.precision import array_function, in_float64, unmasked
 from etid.recordings.errors import RecordingError
 from etid.results.driver import Calibration, ContinuousDriver
 from etid.results.feed import SourceImpedance
 from etid.results.fit import complex_rrse
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import real_parts
-from etid.signals.missing import unmasked
 from etid.solvers.matrices import inverse
 
 METHOD = "impedance"

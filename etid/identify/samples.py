@@ -12,13 +12,12 @@ from etid.estimators.lanes import AbstractLane, Harmonics, constant
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import require
 from etid.identify.options import Options, candidates_of
-from etid.precision import array_function, in_float64, namespace, untraced
+from etid.precision import array_function, in_float64, namespace, unmasked, untraced
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.signals.harmonics import harmonics, same_unloaded, whole_periods
-from etid.signals.missing import unmasked
 from etid.signals.noise import Measurement, floor, noise
 from etid.signals.transfer import AnyArray
 

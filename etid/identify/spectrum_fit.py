@@ -26,7 +26,7 @@ from etid.recordings.remarks import Remark
 from etid.results.data import MeasuredImpedance
 from etid.results.fit import Fit, Support, complex_rrse
 from etid.results.method_options import options_of
-from etid.results.residual import RUNS, TAILS, noise_in
+from etid.results.unlike_noise import RUNS, TAILS, noise_in
 from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.solvers.matrices import inverse
 

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from etid.circuits.display import several
 from etid.circuits.overview import Overview, Overviewed
+from etid.precision import unmasked
 from etid.recordings.errors import RecordingError, located, optional, require_file
 from etid.recordings.tables import rows_of
-from etid.signals.missing import unmasked
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int
 from etid.recordings import faults
 from etid.recordings.faults import covariance_of
 from etid.recordings.recording import Recording, Samples, quietly
-from etid.recordings.refusals import refused
 from etid.recordings.remarks import Remark
 from etid.signals.averaging import Differing, differing_aliases, exact_spacing, without_aliases
 from etid.signals.bins import are_coherent
@@ -323,7 +322,7 @@ class Inspection:
 
         Properties of a recording with one fault may have no meaning, and are not asked for.
         """
-        return refused(self)
+        return faults.refused(self)
 
     @functools.cached_property
     @quietly()

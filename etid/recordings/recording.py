@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from etid.circuits.display import SYMBOLS, several
 from etid.circuits.overview import Overview, Overviewed
+from etid.precision import unmasked
 from etid.recordings.errors import RecordingError as RecordingError
 from etid.recordings.errors import located, not_recorded
 from etid.recordings.fields import (
@@ -33,7 +34,6 @@ from etid.recordings.fields import (
     real,
 )
 from etid.recordings.splitting import split
-from etid.signals.missing import unmasked
 from etid.signals.pulse_train import find_pulses
 from etid.signals.rounding import printed_step
 

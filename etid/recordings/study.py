@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from etid.circuits.display import several
 from etid.circuits.overview import ROWS, Overview, Overviewed
+from etid.precision import unmasked
 from etid.recordings.fields import LABELS, Label, Metadata, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
-from etid.signals.missing import unmasked
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

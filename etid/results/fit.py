@@ -24,7 +24,7 @@ from etid.results.instrument import Effects, largest
 from etid.results.method_options import without_known
 from etid.results.posterior import tails
 from etid.results.presented import Presented
-from etid.results.residual import why_not_noise
+from etid.results.unlike_noise import why_not_noise
 from etid.results.verdicts import RESULTS, Judged, counted, leaving, message
 from etid.signals.transfer import AnyArray, power
 

@@ -11,10 +11,9 @@ from etid.estimators.steiglitz_mcbride.iteration import (
     iterate,
     no_poles,
 )
-from etid.precision import array_function, in_float64, namespace
+from etid.precision import array_function, in_float64, namespace, unmasked
 from etid.results.fit import rrse
 from etid.signals.filtering import from_rest
-from etid.signals.missing import unmasked
 from etid.signals.transfer import AnyArray, Rational
 
 
