@@ -139,3 +139,11 @@ def test_elements_are_right_within_wider_errors(bits, full_scale, snr_db, codes)
     errors = np.sqrt(np.diag(fit.cov))
     assert (np.abs(fit.circuit.values() - np.array(truth)) < 4 * errors).all()
     assert (errors < 0.4 * np.array(truth)).all()
+
+
+def test_a_command_of_few_values_has_no_converter_step():
+    current = np.zeros(4000)
+    current[200:400], current[400:600] = 5e-4, -5e-4
+    v_out = 1e3 * current + 1e-3 * np.random.default_rng(0).standard_normal(current.size)
+    one = etid.Recording(v_out=v_out, current=current, sample_rate=20e3, pulse_rate=5.0)
+    assert np.asarray(Inspected.of(one).step).tolist() == [0.0, 0.0]

@@ -103,6 +103,7 @@ class Inspection:
         step = np.array(stated)
         few = (step == 0) & shows_few(self.recorded)
         few[self.held, 0] = False  # a command has the values that it has
+        few &= not self.has_current  # one of both may be a command that was not measured
         for at in map(tuple, np.argwhere(few)):
             step[at] = step_of(self.recorded[at])
         return step
@@ -139,8 +140,9 @@ class Inspection:
         """Converter steps [V] that exceed the noise, else 0."""
         found = np.zeros(self.step.shape)
         spans = np.ptp(self.recorded_limits, axis=-1)
-        for at in map(tuple, np.argwhere(self.step > VISIBLE * spans)):
-            step = float(self.step[at])
+        visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.recorded))
+        for at in map(tuple, np.argwhere(visible)):
+            step = float(self.step[at]) or step_of(self.recorded[at])
             found[at] = step if is_coarse(self.recorded[at], step) else 0.0
         found[self.held, 0] = 0.0  # a command has the values that it has
         return found
