@@ -149,7 +149,7 @@ def test_a_clock_that_is_off_is_counted_and_said(periods, ppm):
     assert abs(counted - 1e-6 * ppm) < 0.5 / span
     assert (counted == 0) == (abs(ppm) * 1e-6 * span < 0.5)
     assert preflight(seen) is None
-    assert seen.remarks == (Remark.pulse_rate_counted if abs(ppm) > 100 else Remark(0))
+    assert seen.remarks == (Remark.pulse_rate_counted if abs(ppm) > 300 else Remark(0))
 
 
 def test_other_signals_have_no_pulses_to_compare():

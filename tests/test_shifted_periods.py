@@ -121,9 +121,11 @@ def test_elements_behind_a_lost_sample_are_right(records, load):
     np.testing.assert_array_equal(told, np.logical_not(fifth))
 
 
-def test_a_sample_that_both_records_lost_is_a_likely_cause_of_another_pulse_rate():
+def test_samples_that_both_records_lost_are_a_likely_cause_of_another_pulse_rate():
     """Its fit was successful with ± that are four times as large, and no word."""
     one = rung("dry", snr_db=60.0).simulate(1)[TRIAL]
-    both = {name: np.delete(getattr(one, name), 4000) for name in ("v_th", "v_out")}
+    both = {
+        name: np.delete(getattr(one, name), np.arange(4000, 4004)) for name in ("v_th", "v_out")
+    }
     (said,) = texts(Inspected.of(one.replace(**both)).remarks)
     assert "a sample lost or recorded twice in both records" in said

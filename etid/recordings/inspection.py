@@ -444,8 +444,8 @@ class Inspection:
             Remark.periods_left_out: self.periods[0] < self.whole_periods[0],
             Remark.periods_shifted: np.array([shifts is not None for shifts in self.shifts]),
             Remark.coarse_converter: self.coarse.any(1),
-            # A quartz is not more than 100 ppm wrong.
-            Remark.pulse_rate_counted: np.abs(self.counted / self.pulse_rate - 1) > 1e-4,
+            # A clock is not more than 300 ppm wrong.
+            Remark.pulse_rate_counted: np.abs(self.counted / self.pulse_rate - 1) > 3e-4,
         }
         return np.asarray(sum(int(remark) * holds for remark, holds in found.items()))
 
