@@ -12,8 +12,6 @@ z is what the calibrations leave open of Z_th, in their standard deviations; a p
 
 import math
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -22,11 +20,11 @@ from etid.circuits.display import several, significant
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
-from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, taken, unstacked
+from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, unstacked
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.rows import (
     calibrated,
-    fit_one,
+    fit_lane,
     fit_rows,
     load_of,
     source_of,
@@ -277,10 +275,8 @@ class Likelihood(Overviewed, Module):
             prior = ElementPrior.by(own, circuit)
             method = f"{method} with the prior {getattr(own, '__qualname__', own)}"
         of = self.feed, self.known, circuit, method, prior, (), ACCEPT
-        if is_traced(self):
-            return fit_one(jax.tree.map(jnp.asarray, self.lane), *of)
-        if self.lane.x.ndim == 1:
-            return taken(fit_rows([self.lane], *of)[0], 0)
+        if is_traced(self) or self.lane.x.ndim == 1:
+            return fit_lane(self.lane, *of)
         return concatenated(fit_rows(unstacked(self.lane), *of))
 
     @property

@@ -147,7 +147,8 @@ def _restricted(of: Calibrations, near: Near) -> Restricted:
     signal = near.condensed.rows(by_log[None])
     # δ that moves each term by what it has; without any, by its noise.
     size = np.sqrt((terms**2).sum(-1) / (signal**2).sum(-1))
-    none = np.zeros((1, len(known) - 1))
+    count = len(known) - 1
+    none = np.zeros((1, count, count)), np.zeros((1, count))  # the priors are among the terms
     known = np.concatenate([known, priors], 1)
     unit = np.pad(unit, ((0, 0), (0, priors.shape[1])))
-    return restricted(known[None], unit[None], none[..., None] * none, none, size, harmonics)
+    return restricted(known[None], unit[None], *none, size, harmonics)

@@ -233,8 +233,7 @@ def _estimate(load: Load, least: Minimum) -> Estimate:
     by_term = elements @ linear.jacobian
     own = (by_term * mean_private[..., None, :]) @ by_term.swapaxes(-1, -2)
     of_own = elements[..., :owned]
-    told = load.told(at).matrix[..., :owned, :owned]
-    own = own + of_own @ told @ of_own.swapaxes(-1, -2)
+    own = own + of_own @ linear.spread[..., :owned, :owned] @ of_own.swapaxes(-1, -2)
     of_driver = elements[..., owned:]
     shared = of_driver @ source.cov @ of_driver.swapaxes(-1, -2)
     if load.unloaded is not None:

@@ -97,11 +97,16 @@ class Inspection:
 
     @functools.cached_property
     @quietly()
+    def _few(self) -> Bool[np.ndarray, "recording 2"]:
+        return shows_few(self.recorded)
+
+    @functools.cached_property
+    @quietly()
     def step(self) -> Float[np.ndarray, "recording 2"]:
         """Converter steps [V], stated or seen in the values; 0 if unknown."""
         stated = [[v.resolution or 0.0 for v in _records(one)] for one in self.recordings]
         step = np.array(stated)
-        few = (step == 0) & shows_few(self.recorded)
+        few = (step == 0) & self._few
         few[self.held, 0] = False  # a command has the values that it has
         few &= not self.has_current  # one of both may be a command that was not measured
         for at in map(tuple, np.argwhere(few)):
@@ -140,7 +145,7 @@ class Inspection:
         """Converter steps [V] that exceed the noise, else 0."""
         found = np.zeros(self.step.shape)
         spans = np.ptp(self.recorded_limits, axis=-1)
-        visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.recorded))
+        visible = (self.step > VISIBLE * spans) | ((self.step == 0) & self._few)
         for at in map(tuple, np.argwhere(visible)):
             step = float(self.step[at]) or step_of(self.recorded[at])
             found[at] = step if is_coarse(self.recorded[at], step) else 0.0

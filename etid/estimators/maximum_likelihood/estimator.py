@@ -3,8 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
@@ -23,14 +21,13 @@ from etid.estimators.estimator import (
     serving,
 )
 from etid.estimators.judgement import STRAINED
-from etid.estimators.lanes import AbstractLane, Bins, Harmonics, HarmonicsWithCurrent, Held, taken
+from etid.estimators.lanes import AbstractLane, Bins, Harmonics, HarmonicsWithCurrent, Held
 from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.rows import fit_one, fit_rows
+from etid.estimators.maximum_likelihood.rows import fit_lane, fit_rows
 from etid.estimators.maximum_likelihood.verdict import ACCEPT
 from etid.estimators.refined_driver import from_harmonics
 from etid.likelihood.of_calibrations import MISSING_POLE
-from etid.precision import is_traced
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
@@ -195,10 +192,8 @@ class MaximumLikelihood(AbstractEstimator):
         JAX can transform it; without JAX it is a fit of one row.
         """
         prior = ElementPrior.of(self.known_elements, circuit)
-        of = driver, known, circuit, str(self), prior, self.bounds
-        if is_traced((lane, driver, known)):
-            return fit_one(jax.tree.map(jnp.asarray, lane), *of, self.accept)
-        return taken(fit_rows([lane], *of, self.accept)[0], 0)
+        of = known, circuit, str(self), prior, self.bounds, self.accept
+        return fit_lane(lane, driver, *of)
 
     def fit_rows(
         self,

@@ -5,13 +5,14 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.lanes import Bins, Harmonics, HarmonicsWithCurrent, Held, stacked
+from etid.estimators.lanes import Bins, Harmonics, HarmonicsWithCurrent, Held, stacked, taken
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.verdict import judged
 from etid.likelihood.fit import Estimate, fit
@@ -24,7 +25,7 @@ from etid.likelihood.source_prior import DELAY_WIDTH
 from etid.likelihood.starts import starts
 from etid.likelihood.transient import Transient, ends, width_of
 from etid.likelihood.unloaded import differs
-from etid.precision import array_function, namespace, one_thread
+from etid.precision import array_function, is_traced, namespace, one_thread
 from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.instrument import Instrument
@@ -173,6 +174,13 @@ def estimates(
         if known.shape is not None:
             changed = differs(known.shape, load.records)
         yield fit(load, starts(load), float(known.aside), inexact), changed
+
+
+def fit_lane(lane: Harmonics, driver: AbstractFeed, known: GivenDriver, *of: Any) -> Fit:
+    """The fit of a recording; JAX can transform it, without JAX it is a fit of one row."""
+    if is_traced((lane, driver, known)):
+        return fit_one(jax.tree.map(jnp.asarray, lane), driver, known, *of)
+    return taken(fit_rows([lane], driver, known, *of)[0], 0)
 
 
 @one_thread()
