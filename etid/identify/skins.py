@@ -98,8 +98,8 @@ def identify_skin(
         fixed: Known values of elements by name [SI], as in `{"r_s": 500.0}`. Their standard errors
             are 0.
         prior: Values of elements with their standard deviations, as in `{"r_s": (500.0, 50.0)}`;
-            the standard errors of the fit contain this knowledge. Each set of values compiles a
-            program of its own. Maximum likelihood and output error take known elements.
+            the standard errors of the fit contain this knowledge. Maximum likelihood and output
+            error take known elements.
         bounds: Least and largest possible values of elements [SI], as in `{"r_s": (100.0, 2e3)}`;
             None where there is none. The estimate is the mean of what the likelihood leaves inside,
             and the standard errors are its own. The remark `at_bound` says that an element would
