@@ -2,6 +2,7 @@
 
 import ast
 import csv
+import functools
 import pathlib
 import subprocess
 
@@ -17,7 +18,7 @@ MADE_BY = {  # tables whose names are not those of their benchmarks
 }
 # No number of a benchmark depends on them.
 SHOWN = (
-    *("cli.py", "commands", "files", "garbage.py", "live", "plotting", "report"),
+    *("__main__.py", "cli.py", "commands", "files", "garbage.py", "live", "plotting", "report"),
     *("results/variation.py", "simulation/calibration.py"),
     *(f"display/{name}" for name in ("command.py", "page.html", "server.py", "view.py")),
 )
@@ -43,29 +44,34 @@ def commits(table):
         return {row["commit"].rstrip("+") for row in csv.DictReader(file)}
 
 
-def code(commit, names):
-    """Statements of modules but imports, without docstrings and messages.
+@functools.cache
+def statements(commit, name):
+    """Statements of a module but imports, without docstrings and messages.
 
-    A text with a space is a message; names have none. A statement that was moved from one module to
-    another is the same, and a new one that is used changes another.
+    A text with a space is a message; names have none.
     """
-    found = {}
-    for name in names:
-        text = git("show", f"{commit}:{name}").stdout
-        if not name.endswith(".py"):
-            found[text] = name
-            continue
-        tree = ast.parse(text)
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-                if ast.get_docstring(node) is not None:
-                    del node.body[0]
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
-                node.value = ""
-        for node in tree.body:
-            if not isinstance(node, ast.Import | ast.ImportFrom):
-                found[ast.dump(node)] = name
-    return found
+    text = git("show", f"{commit}:{name}").stdout
+    if not name.endswith(".py"):
+        return {text}
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            if ast.get_docstring(node) is not None:
+                del node.body[0]
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
+            node.value = ""
+    imports = ast.Import | ast.ImportFrom
+    return {ast.dump(node) for node in tree.body if not isinstance(node, imports)}
+
+
+def first_changed(commit, names):
+    """The first of some modules with a statement that is in none of them today; None without one.
+
+    A statement that was moved from one module to another is the same, and a new one that is used
+    changes another.
+    """
+    now = set().union(*(statements("HEAD", name) for name in names))
+    return next((name for name in names if statements(commit, name) - now), None)
 
 
 TABLES = sorted((ROOT / "benchmarks" / "results").glob("*.csv"))
@@ -85,7 +91,7 @@ def test_a_result_is_of_this_code(table):
     of = ["etid", ":!*.pyi", *(f":!etid/{name}" for name in without)]
     for one in commits(table):
         changed = git("diff", "--name-only", "--no-renames", one, "HEAD", "--", *of).stdout.split()
-        before, now = code(one, changed), code("HEAD", changed)
-        for statement in before.keys() - now.keys():
+        name = first_changed(one, changed)
+        if name is not None:
             command = MADE_BY.get(table.stem, table.stem)
-            pytest.skip(f"{before[statement]} has changed since: python -m benchmarks {command}")
+            pytest.skip(f"{name} has changed since: python -m benchmarks {command}")
