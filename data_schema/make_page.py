@@ -104,8 +104,7 @@ in `loaded/finger`.
 
 FORMATS
 
-A table contains its rate if a preamble of an oscilloscope has a `Sample Interval` or an
-`Increment`. In all formats a name such as `open [mV]`, `open (mV)` or `open / mV` contains a unit.
+In all formats a name such as `open [mV]`, `open (mV)` or `open / mV` contains a unit.
 Columns of one name tell their place: `CH1#2` and `CH1#4` are the second and the fourth column.
 
 The import keeps only a part of a record in memory. MATLAB files before version 7.3, `.npz` files
@@ -232,8 +231,8 @@ scale = 0.0535
 
 [[recording]]
 path = "s01/dry"
-v_th = {channel = "channel 0", rows = 0}
-v_out = {channel = "channel 0", rows = [1, 2]}
+v_th = {channel = "ch0", rows = 0}
+v_out = {channel = "ch0", rows = [1, 2]}
 ```
 
 ### NumPy

@@ -1,12 +1,11 @@
 """Files as instruments write them, made by the libraries that read them; and their import."""
 
-import wave
+import struct
 
 import h5py
 import numpy as np
 import pytest
 import scipy.io
-import scipy.io.wavfile
 from nptdms import ChannelObject, TdmsWriter
 from pyabf.abfWriter import writeABF1
 
@@ -105,14 +104,70 @@ def abf(path, sweeps, sample_rate=200e3, unit="V"):
     return path
 
 
-def wav(path, kind):
-    """A WAV file of two channels of 30 samples at 200 kHz."""
-    if kind == "24 bits":
-        with wave.open(str(path), "wb") as file:
-            file.setparams((2, 3, 200_000, 30, "NONE", ""))
-            file.writeframes(bytes(6 * 30))
+def intan(path, channels, first=0):
+    """An Intan file at 200 kHz: analog inputs {name: codes} of 312.5 uV, and the amplifier `A-000`.
+
+    It measures 195 uV and, in an RHS file, stimulates with -3 and 5 uA. The samples, a multiple of
+    128, are numbered from `first`.
+    """
+    rhs = path.suffix == ".rhs"
+
+    def texts(*several):
+        return b"".join(struct.pack("<I", 2 * len(one)) + one.encode("utf-16le") for one in several)
+
+    if rhs:
+        head = struct.pack("<Ihhfh8fh2f2h3f", 0xD69127AC, 3, 0, 200e3, *[0] * 14, 1e-6, 0, 0)
+        head += texts("", "", "") + struct.pack("<hh", 0, 0)
     else:
-        scipy.io.wavfile.write(path, 200_000, np.arange(60).reshape(30, 2).astype(kind))
+        head = struct.pack("<Ihhfh6fh2f", 0xC6912702, 3, 0, 200e3, *[0] * 10)
+        head += texts("", "", "") + struct.pack("<hh", 0, 13)
+    kinds = {"A-000": 0, **dict.fromkeys(channels, 3)}
+    head += texts("") + struct.pack("<h", 1) + texts("Port A", "A")
+    head += struct.pack("<hhh", 1, len(kinds), 1)
+    for place, (name, kind) in enumerate(kinds.items()):
+        head += texts(f"ANALOG-IN-{place}" if kind else name, name)
+        head += struct.pack("<hhhh", place, place, kind, 1) + bytes(22 if rhs else 20)
+    codes = np.array([*channels.values()], "<u2")
+    amplifier = [[33768] * 128, [256 + 3, 5] * 64] if rhs else [[33768] * 128]
+    with path.open("wb") as file:
+        file.write(head)
+        for start in range(0, codes.shape[1], 128):
+            file.write(np.arange(first + start, first + start + 128, dtype="<i4").data)
+            file.write(np.array(amplifier, "<u2").data)
+            file.write(codes[:, start : start + 128].tobytes())
+    return path
+
+
+def spike2(path, channels, starts=(0,), late=0):
+    """A Spike2 file of 32 bits at 200 kHz: channels in mV, {name: codes}, of 10 / 65536 mV.
+
+    It was sampled from the samples `starts` on, for equal times; all but its first channel `late`
+    samples later.
+    """
+    head = struct.pack(
+        "<h10s8s3hi5hid", 9, b"(C) CED 87", b"", 1, 1, 0, 0, len(channels), 140, 0, 0, 0, 0, 1e-6
+    )
+    place = first = -(-(512 + 140 * len(channels)) // 512)
+    table = blocks = b""
+    for number, (name, codes) in enumerate(channels.items()):
+        pieces = [
+            (start + late * (number > 0) + i, part[i : i + 200].astype("<i2"))
+            for start, part in zip(starts, np.split(codes, len(starts)), strict=True)
+            for i in range(0, len(part), 200)
+        ]
+        begin, last, times = place, place + len(pieces) - 1, (0, 0)
+        for place, (start, piece) in enumerate(pieces, begin):
+            chain = place - 1 if place > begin else -1, place + 1 if place < last else -1
+            times = 5 * start, 5 * (start + len(piece) - 1)
+            block = struct.pack("<iiiihh", *chain, *times, number + 1, len(piece))
+            blocks += (block + piece.tobytes()).ljust(512, b"\0")
+        place += 1
+        title, unit = (bytes([len(text)]) + text.encode() for text in (name, "mV"))
+        sizes = (len(pieces), 0, 0, 0, 512, 200)
+        table += struct.pack("<hiii6h72s", 0, -1, begin, last, *sizes, b"")
+        table += struct.pack("<iih10sfBb", times[1], 5, number, title, 200e3, 1, 0)
+        table += struct.pack("<ff6sh", 1.0, 0.0, unit, 0)
+    path.write_bytes((head.ljust(512, b"\0") + table).ljust(512 * first, b"\0") + blocks)
     return path
 
 

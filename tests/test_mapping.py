@@ -186,8 +186,8 @@ def test_rows_choose_sweeps_and_their_labels_may_be_given(run, tmp_path):
         scale = 1
         path = "s01/dry"
         trial = ["first", "second"]
-        v_th = {channel = "channel 0", rows = [0, 0]}
-        v_out = {channel = "channel 0", rows = [3, 1]}
+        v_th = {channel = "ch0", rows = [0, 0]}
+        v_out = {channel = "ch0", rows = [3, 1]}
         """
     recordings, used = run(text, source)
     assert [one.trial for one in recordings.values()] == ["first", "second"]
@@ -196,7 +196,7 @@ def test_rows_choose_sweeps_and_their_labels_may_be_given(run, tmp_path):
     for one, row in zip(recordings.values(), (3, 1), strict=True):
         np.testing.assert_allclose(one.v_out, sweeps[row], rtol=0, atol=1.001 * step)
         np.testing.assert_allclose(one.v_th, sweeps[0], rtol=0, atol=1.001 * step)
-    with pytest.raises(RecordingError, match=r"v_th: 3 rows of 'channel 0' with 800 samples, v_o"):
+    with pytest.raises(RecordingError, match=r"v_th: 3 rows of 'ch0' with 800 samples, v_o"):
         run(text.replace("rows = [0, 0]", "rows = [0, 1, 2]"), source)
     single = run(
         text.replace("[3, 1]", "2").replace("[0, 0]", "0").replace('", "second', ""), source

@@ -9,7 +9,6 @@ import pytest
 
 import etid
 from etid import cli
-from etid.commands import importing as importing_command
 from etid.files import formats, readers
 from etid.recordings import hdf5, schema
 
@@ -45,26 +44,21 @@ def test_texts_of_every_hdf5_kind_are_read_alike():
 
 
 def test_a_format_is_declared_once_and_everything_that_lists_formats_comes_from_there(tmp_path):
-    suffixes = [suffix for one in formats.FORMATS for suffix in one.suffixes]
+    suffixes = formats.SUFFIXES
     assert len(suffixes) == len(set(suffixes))
+    project = tomllib.loads((FOLDER.parent / "pyproject.toml").read_text("utf-8"))["project"]
     page = (FOLDER / "README.md").read_text("utf-8")
-    told = importing_command.__doc__ or ""
-    for one in formats.FORMATS:
+    for one in formats.READERS:
+        needed = project["optional-dependencies"].get(one.extra, [""])
+        assert [name.partition(">")[0] for name in needed] == [one.package]
         for suffix in one.suffixes:
             assert f"`{suffix}`" in page.split("## Other formats")[1]
             assert f"`{suffix}`" in (etid.import_file.__doc__ or "")
-            assert suffix in told
-            assert formats.format_of(tmp_path / f"a{suffix.upper()}") is one
+            assert formats.reader_of(tmp_path / f"a{suffix.upper()}") is one
     with pytest.raises(etid.RecordingError, match=", ".join(map(re.escape, suffixes))):
-        formats.format_of(tmp_path / "a.asc")
+        formats.reader_of(tmp_path / "a.asc")
     modules = {one.name for one in pkgutil.iter_modules(readers.__path__)}
-    opened = {one.opened.__module__.rpartition(".")[2] for one in formats.FORMATS}
-    assert modules == opened
-
-
-def test_the_extra_of_a_format_exists():
-    project = tomllib.loads((FOLDER.parent / "pyproject.toml").read_text("utf-8"))["project"]
-    assert {*formats.EXTRAS} <= {*project["optional-dependencies"]}
+    assert modules == {one.opened.__module__.rpartition(".")[2] for one in formats.READERS}
 
 
 def test_the_help_of_the_command_lists_the_formats():

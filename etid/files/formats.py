@@ -1,108 +1,58 @@
-"""The formats of files that the import reads, each declared once.
+"""The formats of files that the import reads, and what other programs can export.
 
-The reader, the page of the schema, the help of the command, the docstring of `etid.import_file` and
-the errors take a format from here.
+The page of the schema, the help of the command, the docstring of `etid.import_file` and the errors
+are made from what each reader declares.
 """
 
-import contextlib
-import dataclasses
 import pathlib
 import textwrap
-from collections.abc import Callable
 
-from etid.files.channel import Contents
-from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
+from etid.files.readers import (
+    Reader,
+    delimited,
+    electrophysiology,
+    excel,
+    lvm,
+    matlab,
+    npz,
+    tdms,
+    wav,
+)
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import HDF5
 
-
-@dataclasses.dataclass(frozen=True)
-class Format:
-    """A format of files.
-
-    Attributes:
-        suffixes: Suffixes of the names of its files.
-        opened: The reader (`etid.files.readers`).
-        channels: What its channels are, in Markdown.
-        contains: What a file says of its channels.
-        trials: What of a channel becomes trials.
-        extra: Extra of etid with the package that the reader needs; empty if it needs none.
-        dialect: Whether the user may tell how the text is written (`delimited.Dialect`).
-    """
-
-    suffixes: tuple[str, ...]
-    opened: Callable[..., contextlib.AbstractContextManager[Contents]]
-    channels: str
-    contains: str
-    trials: str
-    extra: str = ""
-    dialect: bool = False
-
-
-FORMATS = (
-    Format(
-        (".csv", ".txt", ".dat"),
-        delimited.opened,
-        "columns of a table of text, by the line with their names",
-        "units: `open [mV]`, or a second line of them",
-        "none",
-        dialect=True,
-    ),
-    Format(
-        (".mat",),
-        matlab.opened,
-        "variables of MATLAB: `a.b` for field b of structure a, `a(2).b` in an array of "
-        "structures, `c{3}` for a cell, `m(:,2)` for a column of a matrix",
-        "nothing",
-        "rows",
-    ),
-    Format(
-        (".tdms",),
-        tdms.opened,
-        "`group/channel` of NI files",
-        "units (`unit_string`), rate (`wf_increment`)",
-        "none",
-        "tdms",
-    ),
-    Format(
-        (".abf",),
-        abf.opened,
-        "ADC channels of Axon files, or `channel 0`, …",
-        "units and rate",
-        "sweeps",
-        "abf",
-    ),
-    Format((".npz",), npz.opened, "arrays of NumPy", "nothing", "rows"),
-    Format((".wav",), wav.opened, "`1`, `2`, …, as fractions of full scale", "rate", "none"),
-    Format(
-        (".lvm",),
-        lvm.opened,
-        "columns of LabVIEW, one header per file",
-        "units, rate (`Delta_X`)",
-        "none",
-    ),
-    Format(
-        (".xlsx",),
-        excel.opened,
-        "columns of Excel; further sheets `sheet/column`",
-        "units as in a table of text",
-        "none",
-        "excel",
-    ),
+READERS: tuple[Reader, ...] = tuple(
+    module.READER for module in (delimited, matlab, tdms, electrophysiology, npz, wav, lvm, excel)
 )
-SUFFIXES = tuple(suffix for one in FORMATS for suffix in one.suffixes)
-OF_TEXT = tuple(suffix for one in FORMATS if one.dialect for suffix in one.suffixes)
-EXTRAS = tuple(one.extra for one in FORMATS if one.extra)
+SUFFIXES = tuple(suffix for one in READERS for suffix in one.suffixes)
+OF_TEXT = tuple(suffix for one in READERS if one.dialect for suffix in one.suffixes)
+
+# Suffixes of known files that etid cannot read: what writes them, and what to export instead.
+EXPORTS = {
+    ".smrx": ("Spike2", ".smr, or as .mat"),
+    ".plx .pl2": ("Plexon", ".mat, as with NeuroExplorer"),
+    ".ns1 .ns2 .ns3 .ns4 .ns5 .ns6 .nev": ("Blackrock", ".mat, as with NPMK"),
+    ".adicht": ("LabChart", ".mat or .txt"),
+    ".acq": ("AcqKnowledge", ".mat or .txt"),
+    ".cfs": ("Signal", ".mat or .txt"),
+    ".wcp .edr": ("WinWCP or WinEDR", ".abf"),
+    ".vhdr .vmrk .eeg .edf .bdf": ("an EEG system", ".mat or .csv"),
+    ".wfm .isf .trc": ("an oscilloscope", ".csv"),
+    ".mf4 .mdf": ("a data logger", ".mat or .csv"),
+    ".tdm .tdx": ("DIAdem", ".tdms"),
+    ".xls .xlsm .ods": ("a spreadsheet", ".xlsx"),
+    ".npy .parquet .pkl": ("Python", ".npz, with numpy.savez"),
+}
 
 
-def format_of(path: pathlib.Path) -> Format:
-    """The format of a file, by its suffix.
+def reader_of(path: pathlib.Path) -> Reader:
+    """The reader of a file, by its suffix.
 
     Raises:
         RecordingError: No format has this suffix.
     """
     suffix = path.suffix.lower()
-    for one in FORMATS:
+    for one in READERS:
         if suffix in one.suffixes:
             return one
     if suffix in HDF5:
@@ -112,6 +62,13 @@ def format_of(path: pathlib.Path) -> Format:
             remedy=f"Use it as it is, as in etid check {path}; write that of another program anew, "
             "as data_schema/README.md shows",
         )
+    for suffixes, (program, others) in EXPORTS.items():
+        if suffix in suffixes.split():
+            raise RecordingError(
+                f"is a file of {program}, which etid cannot read",
+                file=str(path),
+                remedy=f"Export it as {others}",
+            )
     raise RecordingError(
         f"etid cannot import files with the suffix {path.suffix!r}",
         file=str(path),
@@ -123,18 +80,23 @@ def format_of(path: pathlib.Path) -> Format:
 def as_list() -> str:
     """The formats as a list in Markdown."""
     lines = []
-    for one in FORMATS:
-        suffixes = ", ".join(f"`{suffix}`" for suffix in one.suffixes)
+    for one in READERS:
         extra = f" They need the extra `{one.extra}`." if one.extra else ""
-        lines.append(textwrap.fill(f"- {suffixes}: {one.channels}.{extra}", subsequent_indent="  "))
+        text = f"- {_suffixes(one)}: {one.channels}.{extra}"
+        lines.append(textwrap.fill(text, subsequent_indent="  "))
     return "\n".join(lines)
 
 
 def as_table() -> str:
     """The formats as a table in Markdown."""
-    lines = ["| file | channels | the file contains | trials | install |", "|---|---|---|---|---|"]
-    for one in FORMATS:
-        suffixes = ", ".join(f"`{suffix}`" for suffix in one.suffixes)
-        extra = f"`.[{one.extra}]` " if one.extra else ""
-        lines.append(f"| {suffixes} | {one.channels} | {one.contains} | {one.trials} | {extra}|")
-    return "\n".join(lines)
+    head = ("file", "channels", "unit in the file", "rate in the file", "trials", "install")
+    rows = [head, ("---",) * len(head)]
+    for one in READERS:
+        extra = f"`.[{one.extra}]`" if one.extra else ""
+        known = (cell or "no" for cell in (one.unit, one.rate, one.trials))
+        rows.append((_suffixes(one), one.channels, *known, extra))
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _suffixes(one: Reader) -> str:
+    return ", ".join(f"`{suffix}`" for suffix in one.suffixes)

@@ -180,7 +180,7 @@ def converted(
         raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
     for path in said:
         require_file(str(path))
-        formats.format_of(path)
+        formats.reader_of(path)
     sources: dict[str, AbstractSource] = {}
     used: list[Imported] = []
     calibrations: dict[str, Metadata] = {}
@@ -189,14 +189,14 @@ def converted(
             file = str(path)
             written = {name: table[name] for name in delimited.DIALECT if name in table}
             told = {name: value for name, value in table.items() if name not in written}
-            if not formats.format_of(path).dialect:
+            if not formats.reader_of(path).dialect:
                 _refuse(written, file, f"is only for tables of text: {', '.join(formats.OF_TEXT)}")
             with located(file):
 
                 def opened(one: pathlib.Path, written: Mapping[str, Any] = written) -> Contents:
-                    its = formats.format_of(one)
+                    its = formats.reader_of(one)
                     own = written if its.dialect else {}
-                    return files.enter_context(its.opened(one, folder, **own))
+                    return files.enter_context(its.open(one, folder, **own))
 
                 contents = opened(path)
                 with located(place + file):

@@ -22,8 +22,8 @@ def check_ending(path: str | os.PathLike[str], endings: tuple[str, ...] = HDF5) 
     # Formats that etid reads or writes, and formats that people expect of it.
     formats = {
         *(*HDF5, ".csv", ".txt", ".json", ".toml", ".parquet", ".nwb", ".cir", ".html", ".htm"),
-        *(".mat", ".tdms", ".abf", ".npz", ".npy", ".wav", ".lvm", ".xls", ".xlsx"),
-        *(".pdf", ".png", ".svg"),
+        *(".mat", ".tdms", ".npz", ".npy", ".wav", ".lvm", ".xls", ".xlsx", ".dat"),
+        *(".abf", ".rhd", ".rhs", ".smr", ".pdf", ".png", ".svg"),
     }
     if suffix in formats and suffix not in endings:
         name = file.with_suffix(endings[0]).name

@@ -36,6 +36,7 @@ from etid.files.channel import (
     spooled,
     with_unit,
 )
+from etid.files.readers import Reader
 from etid.recordings.recording import RecordingError
 
 ROWS = 1 << 16  # rows of text in memory at a time
@@ -391,3 +392,13 @@ def _preamble(path: pathlib.Path, dialect: Dialect) -> tuple[float, float | None
                 if interval is not None:
                     rate = rate_of(interval, 1e-6, unit)
     return length, rate
+
+
+READER = Reader(
+    (".csv", ".txt", ".dat"),
+    opened,
+    "columns of a table of text, by the line with their names",
+    unit="`open [mV]`, or a second line of units",
+    rate="a preamble with `Sample Interval` or `Increment`",
+    dialect=True,
+)

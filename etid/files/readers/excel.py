@@ -13,14 +13,16 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from etid.files.channel import Contents, by_place, one_unit, spooled, with_unit
+from etid.files.readers import Reader
 from etid.files.readers.delimited import ROWS, Dialect
-from etid.recordings.errors import RecordingError, optional
+from etid.recordings.errors import RecordingError
 
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Columns of a workbook."""
-    openpyxl = optional("openpyxl", "excel", str(path))
+    import openpyxl
+
     names: list[str] = []
     places: dict[str, tuple[Any, int, int]] = {}  # sheet, first row of numbers, column
     units: dict[str, str] = {}
@@ -67,3 +69,13 @@ def _numbers(sheet: Any, first: int, column: int) -> Iterator[float]:
         if isinstance(cell, bool) or not isinstance(cell, int | float):
             raise RecordingError(f"row {row} of column {column} is {cell!r}, not a number")
         yield float(cell)
+
+
+READER = Reader(
+    (".xlsx",),
+    opened,
+    "columns of Excel; further sheets `sheet/column`",
+    unit="as in a table of text",
+    extra="excel",
+    package="openpyxl",
+)

@@ -16,6 +16,7 @@ import numpy as np
 
 from etid.files.channel import Contents, by_place, rate_of, spooled
 from etid.files.clock import QUARTZ
+from etid.files.readers import Reader
 from etid.files.readers.delimited import LINES, Dialect, spool
 from etid.recordings.recording import RecordingError
 
@@ -100,3 +101,8 @@ def _check_times(times: np.ndarray, rate: float) -> None:
 
 def _first(said: dict[str, list[str]], key: str, default: str) -> str:
     return (said.get(key) or [default])[0].strip() or default
+
+
+READER = Reader(
+    (".lvm",), opened, "columns of LabVIEW, one header per file", "`Y_Unit_Label`", "`Delta_X`"
+)

@@ -19,6 +19,7 @@ import scipy.io
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
 from etid.files.channel import Channel, Contents
+from etid.files.readers import Reader
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.untrusted import attribute, check_size, guarded, local_link
@@ -193,3 +194,12 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, _Variable]]:
     else:
         array = value.squeeze()
         yield name, _Variable(array.shape, array.dtype, array.__getitem__)
+
+
+READER = Reader(
+    (".mat",),
+    opened,
+    "variables of MATLAB: `a.b` for field b of structure a, `a(2).b` in an array of structures, "
+    "`c{3}` for a cell, `m(:,2)` for a column of a matrix",
+    trials="rows",
+)

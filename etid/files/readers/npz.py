@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from etid.files.channel import Channel, Contents, array_channel
+from etid.files.readers import Reader
 from etid.recordings.recording import RecordingError
 
 
@@ -24,3 +25,6 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
             return array_channel(name, np.atleast_1d(archive[name]))
 
         yield Contents(tuple(archive.files), channel)
+
+
+READER = Reader((".npz",), opened, "arrays of NumPy", trials="rows")

@@ -13,14 +13,17 @@ from typing import Any
 import numpy as np
 
 from etid.files.channel import Channel, Contents, one_unit, rate_of
-from etid.recordings.errors import RecordingError, optional
+from etid.files.readers import Reader
+from etid.recordings.errors import RecordingError
 
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Channels of a TDMS file."""
     del folder
-    nptdms, log = (optional(name, "tdms", str(path), "npTDMS") for name in ("nptdms", "nptdms.log"))
+    import nptdms
+    from nptdms import log
+
     _check_length(path)
     console = log.log_manager.console_handler
     with contextlib.ExitStack() as stack:
@@ -108,3 +111,14 @@ def _line(properties: dict[str, Any]) -> tuple[float, float]:
         return 1.0, 0.0
     line = properties["NI_Scale[0]_Linear_Slope"], properties["NI_Scale[0]_Linear_Y_Intercept"]
     return float(line[0]), float(line[1])
+
+
+READER = Reader(
+    (".tdms",),
+    opened,
+    "`group/channel` of NI files",
+    unit="`unit_string`",
+    rate="`wf_increment`",
+    extra="tdms",
+    package="npTDMS",
+)

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.io.wavfile
 
 from etid.files.channel import Channel, Contents, array_channel
+from etid.files.readers import Reader
 from etid.recordings.recording import RecordingError
 
 
@@ -63,3 +64,6 @@ def _check_length(path: pathlib.Path) -> None:
                     remedy="Copy it again, or record it again if the recording program crashed",
                 )
             position += 8 + length + length % 2
+
+
+READER = Reader((".wav",), opened, "`1`, `2`, …, as fractions of full scale", rate="header")
