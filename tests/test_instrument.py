@@ -270,9 +270,8 @@ def test_a_file_with_an_instrument_is_checked_and_fitted_otherwise(tmp_path, cap
         assert fits.fits.verdicts == ["successful"]
 
 
-@pytest.mark.parametrize("resistors", [(R_LOAD,), (R_LOAD, 21.62e3)])
-def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax(resistors):
-    *known, skin = trials({"skin": DRY}, known=resistors).recordings()
+def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax():
+    *known, skin = trials({"skin": DRY}, known=(R_LOAD, 21.62e3)).recordings()
     driver = etid.identify_driver(known, instrument=ALL)
     assert isinstance(driver, HarmonicDriver)
     frequency = driver.spectra.frequency[0]
@@ -387,7 +386,8 @@ def tracked(calibration, skin, instrument):
     return fit, found, np.append(relative(fit) ** 2, (of.charge_stderr / CHARGE) ** 2)
 
 
-@pytest.mark.parametrize("kind", ["dry", pytest.param("damp", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["dry", "damp"])
 def test_a_tracker_has_the_errors_of_the_instrument(kind):
     *_, without = tracked(*exact(kind), etid.Instrument())
     for source, size in ERRORS.items():
@@ -404,6 +404,7 @@ def test_a_tracker_has_the_errors_of_the_instrument(kind):
         np.testing.assert_allclose(added, moved, rtol=0.1, atol=noise, err_msg=source)
 
 
+@pytest.mark.slow
 def test_a_stated_delay_is_no_help_to_a_tracker_whose_windows_begin_between_two_samples():
     calibration, skin = exact()
     found = []
