@@ -22,8 +22,8 @@ def wait(*_):
     print("waiting", flush=True)
     time.sleep(600)
 
-def fit(opened, options, size, number):
-    return study_fits() if number == 0 else wait()
+def fit(drivers, options, total, part):
+    return study_fits() if part[0] == "s01/0" else wait()
 """
 FIT = f"""{WAITS}
 streaming.PART, streaming._fit = 6, fit

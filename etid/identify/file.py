@@ -57,10 +57,10 @@ class ResumeError(ValueError):
 
 
 @functools.cache
-def _kept_open(sources: tuple[str, ...], stamps: tuple[int, ...], options: Options) -> Drivers:
-    """Files in use, for the lifetime of the process: a worker gets its parts one by one."""
-    del stamps
-    return Drivers(_opened(sources), options)
+def _drivers(sources: tuple[str, ...], stamps: tuple[int, ...], options: Options) -> dict[str, Any]:
+    """The drivers of a run that this process has identified: a worker gets its parts one by one."""
+    del sources, stamps, options
+    return {"found": {}, "failures": {}}
 
 
 def _opened(sources: tuple[str, ...]) -> Study:
@@ -68,28 +68,33 @@ def _opened(sources: tuple[str, ...]) -> Study:
     return read_with_driver(*sources) if len(sources) > 1 else read(*sources)
 
 
-def _fit(drivers: Drivers, options: Options, size: int, number: int) -> StudyFits:
+def _fit(drivers: Drivers, options: Options, total: int, part: Sequence[str]) -> StudyFits:
     """The fits of one part, with the drivers of this part only.
 
     This process may have identified the drivers of other parts before.
     """
-    part = drivers.paths[number * size : (number + 1) * size]
-    fits = identify_part(drivers, part, options, len(drivers.paths))
-    used = set()
+    fits = identify_part(drivers, part, options, total)
+    used = {}  # in their order
     for path in part:
         with contextlib.suppress(RecordingError):
-            used.add(drivers.study.metadata(path).calibration or drivers.calibrations)
-    found = {names: driver for names, driver in drivers.found.items() if names in used}
-    failures = {names: text for names, text in drivers.failures.items() if names in used}
+            used[drivers.study.metadata(path).calibration or drivers.calibrations] = True
+    found = {names: drivers.found[names] for names in used if names in drivers.found}
+    failures = {names: drivers.failures[names] for names in used if names in drivers.failures}
     return StudyFits(fits, found, failures)
 
 
 @in_float64
 def _fit_elsewhere(
-    sources: tuple[str, ...], stamps: tuple[int, ...], options: Options, size: int, number: int
+    run: tuple[tuple[str, ...], tuple[int, ...], Options],
+    study: Study,
+    total: int,
+    part: Sequence[str],
 ) -> StudyFits:
     """The fits of one part, in any process that can read the files."""
-    return _fit(_kept_open(sources, stamps, options), options, size, number)
+    *_, options = run
+    drivers = Drivers(study, options)
+    vars(drivers).update(_drivers(*run))
+    return _fit(drivers, options, total, part)  # the file of a pickle is closed with it
 
 
 def _pin(cores: Any, told: Any, level: int) -> None:
@@ -299,12 +304,14 @@ def fit_file(
         }
         parts = _Parts(target, run, resume)
         left = [number for number in numbers if not parts.path(number).exists()]
-        task = functools.partial(_fit, drivers, options, PART)
-        if executor is not None:
-            places = tuple(
-                map(os.path.abspath, sources)
-            )  # another process may be in another folder
-            task = functools.partial(_fit_elsewhere, places, stamps, options, PART)
+        run_of = (tuple(map(os.path.abspath, sources)), stamps, options)
+
+        def task(number: int) -> Callable[[], StudyFits]:
+            part = drivers.paths[number * PART : (number + 1) * PART]
+            if executor is None:
+                return functools.partial(_fit, drivers, options, count, part)
+            return functools.partial(_fit_elsewhere, run_of, study.only(part), count, part)
+
         now: dict[int, StudyFits] = {}  # a file holds less of a fit
         done = min(count, (len(numbers) - len(left)) * PART)
         with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:
@@ -322,16 +329,16 @@ def fit_file(
 
 
 def _results(
-    task: Callable[[int], StudyFits],
+    task: Callable[[int], Callable[[], StudyFits]],
     numbers: Sequence[int],
     executor: concurrent.futures.Executor | None,
 ) -> Iterator[tuple[int, StudyFits]]:
     """Numbers and fits of the parts, in the order in which they finish."""
     if executor is None:
         for number in numbers:
-            yield number, task(number)
+            yield number, task(number)()
         return
-    futures = {executor.submit(task, number): number for number in numbers}
+    futures = {executor.submit(task(number)): number for number in numbers}
     try:
         for future in concurrent.futures.as_completed(futures):
             yield futures.pop(future), future.result()

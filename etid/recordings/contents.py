@@ -6,6 +6,7 @@ The walk reads attributes and the headers of datasets. Samples are read when a r
 import contextlib
 import dataclasses
 import functools
+import os
 import re
 import weakref
 from collections.abc import Callable, Iterator
@@ -38,6 +39,37 @@ from etid.recordings.untrusted import (
 OPEN = 8  # most datasets of stacks that stay open
 
 
+class SamplesFile:
+    """An HDF5 file whose samples are read; a pickle opens it again when it is used."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._file: h5py.File | None = None
+
+    def open(self) -> h5py.File:
+        """The file, open until `close`, and false then."""
+        if self._file is None:
+            self._file = h5py.File(self.name, "r")
+        return self._file
+
+    @functools.cached_property
+    def stack(self) -> Callable[[str], Any]:
+        """A dataset of a stack by its path.
+
+        To open a stack takes as long as to read a row, but an open stack keeps megabytes of chunks
+        in memory.
+        """
+        return functools.lru_cache(OPEN)(self.open().__getitem__)
+
+    def close(self) -> None:
+        """Close the file, if it is open."""
+        if self._file is not None:
+            self._file.close()
+
+    def __reduce__(self) -> tuple:
+        return SamplesFile, (os.path.abspath(self.name),)
+
+
 @dataclasses.dataclass(eq=False)
 class _Block:
     """A recording group of the file: one recording, or a stack of trials.
@@ -45,33 +77,36 @@ class _Block:
     `stacked` are the names of the records with one row for each trial.
     """
 
-    file: h5py.File
-    opened: Callable[[str], Any]
-    name: str
+    samples_of: SamplesFile
     metadata: Metadata
     trials: tuple[str, ...] | None
     layout: tuple[Layout, ...]
     rows: int | None
     stacked: frozenset[str]
-    shared: Callable[[], Samples | None] = lambda: None
+    shared: weakref.ref[Samples] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "trials": None, "shared": None}  # each row has its own trial
 
     def sources(self) -> "Iterator[_Row]":
         recorded = any(record.name == "v_th" for record in self.layout)
         common, own = recorded and "v_th" not in self.stacked, id(self)
         for row in [None] if self.rows is None else range(self.rows):
-            yield _Row(self.layout, (own, None if common else row), self, row)
+            trial = "" if row is None or not self.trials else self.trials[row]
+            yield _Row(self.layout, (own, None if common else row), self, row, trial)
 
     def samples(self, record: Layout, row: int | None) -> Samples:
         name, stacked = record.name, record.name in self.stacked
         common = row is not None and not stacked
-        kept = self.shared() if common else None
+        kept = self.shared() if common and self.shared else None
         if kept is not None:
             return kept
-        with translated(self.name, self.metadata.path, name):
-            if not self.file:
+        with translated(self.samples_of.name, self.metadata.path, name):
+            file = self.samples_of.open()
+            if not file:
                 raise RecordingError("the file is closed", remedy="Read it again, or use `with`")
             path = f"{self.metadata.path}/{name}"
-            dataset = self.opened(path) if stacked else self.file[path]
+            dataset = self.samples_of.stack(path) if stacked else file[path]
             assert isinstance(dataset, h5py.Dataset)  # the scan has checked this
             stored = dataset[row] if stacked else dataset[()]
             stored.flags.writeable = False
@@ -87,14 +122,14 @@ class _Row(AbstractSource):
 
     block: _Block
     row: int | None
+    trial: str
 
     @property
     def metadata(self) -> Metadata:
         common = self.block.metadata
         if self.row is None:
             return common
-        trial = self.block.trials[self.row] if self.block.trials else ""
-        return common.of_trial(f"{common.path}/{self.row}", trial)
+        return common.of_trial(f"{common.path}/{self.row}", self.trial)
 
     def blocks(self, name: str) -> Iterator[np.ndarray]:
         (record,) = (record for record in self.layout if record.name == name)
@@ -110,16 +145,11 @@ class Scan:
 
     Args:
         guarded: The file behind a guard; it is read here only.
-        file: The same file without a guard; samples are read from it later.
-        name: Path of the file.
+        samples_of: The same file without a guard; samples are read from it later.
     """
 
-    def __init__(self, guarded: h5py.File, file: h5py.File, name: str) -> None:
-        self.file = file
-        self.name = name
-        # To open a stack takes as long as to read a row, but an open stack keeps megabytes of
-        # chunks in memory.
-        self.opened = functools.lru_cache(OPEN)(file.__getitem__)
+    def __init__(self, guarded: h5py.File, samples_of: SamplesFile) -> None:
+        self.samples_of, self.name = samples_of, samples_of.name
         self.blocks: dict[str, _Block] = {}
         self.problems: list[RecordingError] = []
         self._kinds: dict[str, str] = {}
@@ -387,9 +417,7 @@ class Scan:
         for trial in trials or ():
             metadata_from(**{**found, "trial": trial})  # checks the text of the label
         return _Block(
-            self.file,
-            self.opened,
-            self.name,
+            self.samples_of,
             metadata,
             trials if stacked else None,
             tuple(layout),

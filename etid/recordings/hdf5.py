@@ -10,14 +10,14 @@ import dataclasses
 import functools
 import os
 import pathlib
-from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 import h5py
 import numpy as np
 
 from etid.recordings import schema
-from etid.recordings.contents import Scan
+from etid.recordings.contents import SamplesFile, Scan
 from etid.recordings.errors import near_miss
 from etid.recordings.fields import Metadata
 from etid.recordings.recording import AbstractSource, RecordingError
@@ -40,18 +40,18 @@ def read(path: str | os.PathLike[str]) -> Study:
     """
     name = os.fspath(path)
     with guarded(name) as metadata:
-        file = h5py.File(name, "r")
+        samples_of = SamplesFile(name)
         try:
+            samples_of.open()
             _check_root(metadata, name)
-            scan = Scan(metadata, file, name)
+            scan = Scan(metadata, samples_of)
         except BaseException:
-            file.close()
+            samples_of.close()
             raise
     first: dict[str, RecordingError] = {}
     for problem in scan.problems:
         first.setdefault(problem.path, problem)
-    again = functools.partial(read, os.path.abspath(name))
-    return Study(scan.sources(), problems=first, file=name, close=file.close, again=again)
+    return Study(scan.sources(), problems=first, file=name, close=samples_of.close)
 
 
 def check(path: str | os.PathLike[str]) -> list[RecordingError]:
@@ -68,9 +68,10 @@ def check(path: str | os.PathLike[str]) -> list[RecordingError]:
     """
     name = os.fspath(path)
     try:
-        with guarded(name) as metadata, h5py.File(name, "r") as file:
+        with guarded(name) as metadata, contextlib.closing(SamplesFile(name)) as samples_of:
+            samples_of.open()
             _check_root(metadata, name)
-            scan = Scan(metadata, file, name)
+            scan = Scan(metadata, samples_of)
             scan.check_samples()
     except RecordingError as problem:
         return [problem]
@@ -257,12 +258,13 @@ def read_with_driver(path: str | os.PathLike[str], driver: str | os.PathLike[str
         known = dataclasses.replace(source.metadata, calibration=names)
         moved[own] = _Moved(source.layout, source.unloaded, source, known)
 
-    def close() -> None:
-        calibrations.close()
-        whole.close()
+    close = functools.partial(_close_both, calibrations.close, whole.close)
+    return Study(moved, problems=whole.problems, file=whole.file, close=close)
 
-    again = functools.partial(read_with_driver, os.path.abspath(path), os.path.abspath(driver))
-    return Study(moved, problems=whole.problems, file=whole.file, close=close, again=again)
+
+def _close_both(*closes: Callable[[], None]) -> None:
+    for close in closes:
+        close()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

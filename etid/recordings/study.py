@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import functools
 import itertools
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -60,7 +61,7 @@ class Study(Overviewed, Mapping[str, Recording]):
     """Ordered recordings by path; recordings of a file are loaded when they are accessed.
 
     `Study.from_recordings` and `etid.read` make a study. A study from a file keeps the file open:
-    use `with`, or call `close()`. A copy or a pickle of such a study opens the file again.
+    use `with`, or call `close()`. A pickle or a deep copy of such a study opens the file again.
 
     Attributes:
         file: Path of the file; empty for a study in memory.
@@ -75,12 +76,10 @@ class Study(Overviewed, Mapping[str, Recording]):
         problems: Mapping[str, RecordingError] | None = None,
         file: str = "",
         close: Callable[[], None] | None = None,
-        again: "Callable[[], Study] | None" = None,
         named: "Study | None" = None,
     ) -> None:
         self._sources = dict(sources)
         self._close = close
-        self._again = again  # opens the file, for a copy or a pickle
         self._named = named
         self.problems: dict[str, RecordingError] = dict(problems or {})
         self.file = file
@@ -222,22 +221,23 @@ class Study(Overviewed, Mapping[str, Recording]):
                 integer.
         """
         wanted = wanted_labels(labels, LABELS)
-        return self._part(
-            lambda metadata: all(
-                getattr(metadata, name) == label for name, label in wanted.items()
-            ),
-            {},  # a recording that cannot be read has no labels
-        )
+        chosen = {
+            path: source
+            for path, source in self._sources.items()
+            if all(getattr(source.metadata, name) == label for name, label in wanted.items())
+        }
+        return self._part(chosen, {})  # a recording that cannot be read has no labels
 
     @property
     def calibrations(self) -> "Study":
         """Study of the recordings with a known resistor."""
-        return self._part(lambda metadata: metadata.kind == "calibration", self.problems)
+        return self._part(self._known, self.problems)
 
     @property
     def loaded(self) -> "Study":
         """Study of the recordings with an unknown load."""
-        return self._part(lambda metadata: metadata.kind == "loaded", self.problems)
+        loaded = {p: of for p, of in self._sources.items() if p not in self._known}
+        return self._part(loaded, self.problems)
 
     @property
     def named(self) -> "Study":
@@ -247,20 +247,25 @@ class Study(Overviewed, Mapping[str, Recording]):
         """
         return self if self._named is None else self._named
 
+    def only(self, paths: Iterable[str]) -> "Study":
+        """Study of the recordings at these paths; those that cannot be read are its problems."""
+        return self._part(
+            {path: self._sources[path] for path in paths if path in self._sources},
+            {path: self.problems[path] for path in paths if path in self.problems},
+        )
+
+    @functools.cached_property
+    def _known(self) -> dict[str, AbstractSource]:
+        """The recordings with a known resistor."""
+        return {p: of for p, of in self._sources.items() if of.metadata.kind == "calibration"}
+
     def _part(
-        self, belongs: Callable[[Metadata], bool], problems: Mapping[str, RecordingError]
+        self, chosen: Mapping[str, AbstractSource], problems: Mapping[str, RecordingError]
     ) -> "Study":
-        of: dict[str, Any] = {"file": self.file, "close": self._close, "again": self._again}
-        chosen, known = {}, {}
-        for path, source in self._sources.items():
-            metadata = source.metadata
-            if belongs(metadata):
-                chosen[path] = source
-            if metadata.kind == "calibration":
-                known[path] = source
+        of: dict[str, Any] = {"file": self.file, "close": self._close}
         named = self._named
         if named is None:
-            named = Study(known, problems=self.problems, **of)
+            named = Study(self._known, problems=self.problems, **of)
         return Study(chosen, problems=problems, named=named, **of)
 
     def write(self, path: str | os.PathLike[str]) -> None:
@@ -291,13 +296,6 @@ class Study(Overviewed, Mapping[str, Recording]):
         known = {name: of for name, of in self.named._sources.items() if name in names}
         write(known | self._sources, path)
 
-    def __reduce__(self) -> tuple:
-        named = None if self._named is None else self._named._sources
-        if self._again is None:
-            return _in_memory_again, (self._sources, named)
-        paths = (None if of is None else tuple(of) for of in (self._sources, named))
-        return _opened, (self._again, *paths, tuple(self.problems))
-
     def close(self) -> None:
         """Close the file of the study; all parts of the study use the same file."""
         if self._close is not None:
@@ -323,8 +321,7 @@ class Study(Overviewed, Mapping[str, Recording]):
     def __repr__(self) -> str:
         place = f" {self.file!r}" if self.file else ""
         bad = f", {len(self.problems)} that cannot be read" if self.problems else ""
-        calibrations = sum(s.metadata.kind == "calibration" for s in self._sources.values())
-        known, loaded = several(calibrations, "calibration"), len(self) - calibrations
+        known, loaded = several(len(self._known), "calibration"), len(self) - len(self._known)
         return f"<Study{place}: {known}, {loaded} loaded{bad}>"
 
 
@@ -349,28 +346,3 @@ def _trials(
         own: dict[str, Any] = {"trial": number, **fields, "path": f"{path}/{number}"}
         found.append(Recording(unloaded if shared else th[number], row, **own))
     return found
-
-
-def _in_memory_again(
-    sources: Mapping[str, AbstractSource], named: Mapping[str, AbstractSource] | None
-) -> Study:
-    """A copy or a pickle of a study in memory becomes this."""
-    return Study(sources, named=None if named is None else Study(named))
-
-
-def _opened(
-    again: Callable[[], Study],
-    paths: Iterable[str],
-    named: Iterable[str] | None,
-    problems: Collection[str],
-) -> Study:
-    """The recordings of a file at these paths; a copy or a pickle of a study becomes this."""
-    whole = again()
-    of: dict[str, Any] = {"file": whole.file, "close": whole.close, "again": again}
-
-    def part(paths: Iterable[str]) -> dict[str, AbstractSource]:
-        return {path: whole.source(path) for path in paths}
-
-    own = {path: error for path, error in whole.problems.items() if path in problems}
-    known = None if named is None else Study(part(named), problems=whole.problems, **of)
-    return Study(part(paths), problems=own, named=known, **of)
