@@ -250,12 +250,21 @@ def test_a_train_that_an_end_of_the_record_cuts_is_left_out_with_a_note(tmp_path
     arrays = {name: array[:end] for name, array in arrays.items()}
     recordings, [used] = of_arrays(tmp_path, arrays, split="pulses")
     assert [one.trial for one in recordings] == ["0", "1", "2"]
-    note = "an end of the record cuts 1 train of pulses, which is left out"
+    note = "the end of the record cuts 1 train of pulses, which is left out"
     assert (used.notices, str(used).splitlines()[-1]) == ((note,), f"  note: {note}")
     first = {name: array[2100 : 2000 + round(3 * PERIOD)] for name, array in arrays.items()}
     first["trigger"][10] = 1.0
-    with pytest.raises(RecordingError, match="an end of the record cuts the first or the last"):
+    with pytest.raises(RecordingError, match="the end of the record cuts the last"):
         of_arrays(tmp_path, first, split="trigger")
+
+
+def test_a_record_may_begin_with_its_first_pulse(tmp_path):
+    arrays = in_turn()
+    begin = np.flatnonzero(np.diff(arrays["th"]) > 10)[0] - 5
+    begun = {name: array[begin:] for name, array in arrays.items()}
+    recordings, [used] = of_arrays(tmp_path, begun, split="pulses")
+    assert [round(one.periods, 2) for one in recordings] == [3, 3, 3, 3]
+    assert not used.notices
 
 
 @pytest.mark.parametrize(
@@ -266,7 +275,7 @@ def test_a_train_that_an_end_of_the_record_cuts_is_left_out_with_a_note(tmp_path
         ({"split": "pulses", "electrode": ["E1", "E2", "E3"]},
          "names 3 electrodes, but the record has 4 trains"),
         ({"split": "pulses", "electrode": ["E7", "E12"], "rests": (0, 0)},
-         "cuts the first or the last"),
+         "cuts the last"),
         ({"split": "what"}, "there is no 'what'"),
         ({"split": "trigger", "electrode": ["E7", "E12"], "trial": 3}, "has 1 label for 4 trials"),
         ({"split": "pulses", "v_out": "stack"}, "can be split"),

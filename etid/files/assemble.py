@@ -170,7 +170,7 @@ def sources_of(
     notices = dict.fromkeys(own.notice for own in channels.values() if own.notice)
     if cut:
         trains = "1 train of pulses, which is" if cut == 1 else f"{cut} trains of pulses, which are"
-        notices[f"an end of the record cuts {trains} left out"] = None
+        notices[f"the end of the record cuts {trains} left out"] = None
     return sources, Imported(
         file, tuple(sources), samples, rate, rate_by, common.pulse_rate, used, (*notices,)
     )

@@ -15,7 +15,7 @@ class Parts(NamedTuple):
 
     Attributes:
         whole: Those with all their samples.
-        cut: How many were left out, because an end of the record cuts them.
+        cut: How many were left out, because the end of the record cuts them.
     """
 
     whole: list[slice]
@@ -41,11 +41,11 @@ def split(
         sample_rate: Samples per second [Hz].
         pulse_rate: Pulses per second [Hz].
         trigger: Trigger.
-        cut: Whether trains that an end of the record cuts may be left out.
+        cut: Whether a train that the end of the record cuts may be left out.
 
     Raises:
-        RecordingError: There are no pauses, no pulses behind an edge of the trigger, or an end of
-            the record cuts a train that may not be left out, or all of them.
+        RecordingError: There are no pauses, no pulses behind an edge of the trigger, or the end of
+            the record cuts a train that may not be left out, or the only one.
     """
     period = sample_rate / pulse_rate
     edges = find_pulses(cause, sample_rate, pulse_rate).edges
@@ -59,15 +59,15 @@ def split(
                 field="v_th",
                 remedy="Name a trigger channel, or do not split the record",
             )
-    # A fifth of the first period lies before its pulse.
-    starts = [int(train[0] - round(0.2 * period)) for train in trains]
+    # A fifth of the first period lies before its pulse, or less where the record begins with it.
+    starts = [max(0, int(train[0] - round(0.2 * period))) for train in trains]
     stops = [at + round(len(train) * period) for at, train in zip(starts, trains, strict=True)]
-    both = zip(starts, stops, strict=True)  # an end of the record may cut a train
-    whole = [slice(start, stop) for start, stop in both if start >= 0 and stop <= cause.size]
+    both = zip(starts, stops, strict=True)
+    whole = [slice(start, stop) for start, stop in both if stop <= cause.size]
     if not whole or (not cut and len(whole) < len(trains)):
         raise RecordingError(
-            "an end of the record cuts the first or the last train of pulses",
-            remedy="Record a period without pulses before the first and behind the last",
+            "the end of the record cuts the last train of pulses",
+            remedy="Record a period without pulses behind it",
         )
     return Parts(whole, len(trains) - len(whole))
 
