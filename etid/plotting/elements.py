@@ -27,8 +27,8 @@ from etid.plotting.style import (
     symbol,
     titled,
 )
-from etid.recordings.contents import ranked
-from etid.recordings.fields import LABELS, check_names
+from etid.recordings.fields import LABELS
+from etid.recordings.labels import check_names, ranked
 from etid.results.fits import Fits
 from etid.results.posterior import Posterior, Profile
 from etid.results.verdicts import counted

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from etid.circuits.display import several
 from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.precision import unmasked
-from etid.recordings.fields import LABELS, Label, Metadata, wanted_labels
+from etid.recordings.fields import LABELS, Metadata
+from etid.recordings.labels import Label, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
 
 

@@ -31,7 +31,7 @@ from etid.plotting.style import (
     svg,
     symbol,
 )
-from etid.recordings.contents import ranked
+from etid.recordings.labels import ranked
 from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits

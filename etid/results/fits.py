@@ -14,9 +14,9 @@ from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.circuits.display import heading, per_cent, plus_minus, scaled, several
 from etid.circuits.lookup import class_path
 from etid.circuits.overview import Overview, Overviewed
-from etid.recordings.contents import natural
 from etid.recordings.errors import install
-from etid.recordings.fields import DESCRIBING, Label, check_names, wanted_labels
+from etid.recordings.fields import DESCRIBING
+from etid.recordings.labels import Label, check_names, natural, wanted_labels
 from etid.results.data import with_data
 from etid.results.fit import Fit, Support
 from etid.results.fits_columns import (

@@ -19,7 +19,8 @@ import scipy.optimize
 
 from etid.circuits.display import per_cent, quantity, several
 from etid.circuits.overview import Overview, Overviewed
-from etid.recordings.fields import LABELS, check_names
+from etid.recordings.fields import LABELS
+from etid.recordings.labels import check_names
 from etid.results.fits import Fits
 
 REST = "recordings"  # the last level: recordings with equal labels
