@@ -78,10 +78,10 @@ from etid.precision import Kept, in_float64, unmasked, untraced
 from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
+from etid.results.columns import described
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import IdentificationError
 from etid.results.fits import Fits
-from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
 
 # A window has faults that a record of several periods has not, and others have other remedies.

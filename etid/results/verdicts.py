@@ -238,9 +238,9 @@ def _of_codes(codes: Int[AnyArray, "*row"]) -> RESULTS:
 
 
 @functools.cache
-def own_part(verdict: str, note: str) -> str:
+def own_part(verdict: str, note: str, spectrum: bool = False) -> str:
     """What a note says beyond the message of its verdict."""
-    common = message(verdict)
+    common = message(verdict, spectrum)
     return " ".join((note.replace(common, " ") if common else note).split())
 
 
