@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 import etid
-from etid.circuits.display import between, quantity
-from etid.circuits.overview import ROWS, Overview
 from etid.display.state import Change
+from etid.printing import ROWS, Overview, between, quantity
 from etid.recordings.remarks import Remark
 from etid.results.columns import described
 from etid.results.data import MeasuredImpedance

@@ -51,8 +51,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit, impedance_at
-from etid.circuits.display import per_cent, several
-from etid.circuits.overview import Overview, Overviewed
 from etid.display.alarms import limit
 from etid.display.clock import Clock
 from etid.display.gain_bands import unloaded_bands
@@ -75,6 +73,7 @@ from etid.identify.arguments import circuit_of, number_of, require
 from etid.identify.fitting import known_at
 from etid.identify.planning import explained
 from etid.precision import Kept, in_float64, unmasked, untraced
+from etid.printing import Overview, Overviewed, per_cent, several
 from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
-from etid.circuits.display import several
+from etid.printing import several
 from etid.recordings import limits, schema
 from etid.recordings.errors import near_miss
 from etid.recordings.fields import SIGNALS, Field, Metadata, metadata_from, tidy_path

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from etid.circuits.display import several
-from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.precision import unmasked
+from etid.printing import ROWS, Overview, Overviewed, several
 from etid.recordings.fields import LABELS, Metadata
 from etid.recordings.labels import Label, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples

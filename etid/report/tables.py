@@ -12,15 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from etid.circuits.display import (
-    as_symbol,
-    between,
-    first_of,
-    heading,
-    plus_minus,
-    scaled,
-    significant,
-)
+from etid.printing import as_symbol, between, first_of, heading, plus_minus, scaled, significant
 from etid.recordings.fields import LABELS
 from etid.report.html import Table
 from etid.report.methods import words

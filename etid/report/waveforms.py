@@ -7,9 +7,9 @@ import pathlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from etid.circuits.display import as_symbol, significant
 from etid.plotting import figure_of
 from etid.plotting.style import svg
+from etid.printing import as_symbol, significant
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study

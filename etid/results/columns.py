@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from etid.circuits.display import significant
+from etid.printing import significant
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.remarks import remarks_of, words
 from etid.results.verdicts import verdicts_of

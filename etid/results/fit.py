@@ -15,9 +15,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import Circuit
 from etid.circuits.directions import ALIKE, DIRECTIONS, FAST, SPREAD, Direction, named
-from etid.circuits.display import quality, quantity, rounded, several
-from etid.circuits.overview import Overview, element_rows
 from etid.precision import Module, namespace
+from etid.printing import Overview, element_rows, per_cent, quality, quantity, rounded, several
 from etid.recordings.remarks import Remark, texts
 from etid.results.columns import described, table_of
 from etid.results.data import HasSource
@@ -193,11 +192,6 @@ class Limited(Module):
         return f"Without bounds, {' and '.join(found)}." if found else ""
 
 
-def _signed(value: float) -> str:
-    """A number with two significant digits and its sign."""
-    return ("+" if value >= 0 else "") + rounded(value)
-
-
 class Fit(Judged, Presented, HasSource[Circuit]):
     """One identified circuit, or a batch of them along a leading axis.
 
@@ -363,7 +357,8 @@ class Fit(Judged, Presented, HasSource[Circuit]):
             return ""
         names = *self.circuit.names(), "amplitude"
         known = [
-            f"{name} {_signed(100 * float(size))} ± {rounded(100 * float(error), 1)} %"
+            f"{name} {'+' if size >= 0 else ''}{rounded(100 * float(size))} ± "
+            f"{per_cent(float(error), 1)}"
             for name, size, error in zip(names, self.change, self.change_stderr, strict=True)
             if error < 1  # else the record does not determine it
         ]

@@ -11,9 +11,8 @@ import numpy as np
 
 import etid
 from etid.circuits.circuit import AbstractCircuit, Circuit
-from etid.circuits.display import heading, per_cent, plus_minus, scaled, several
 from etid.circuits.lookup import class_path
-from etid.circuits.overview import Overview, Overviewed
+from etid.printing import Overview, Overviewed, heading, per_cent, plus_minus, scaled, several
 from etid.recordings.errors import install
 from etid.recordings.labels import Label, check_names, natural, wanted_labels
 from etid.results.columns import DESCRIBED, LABELS, long_form, named, table_of

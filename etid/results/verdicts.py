@@ -16,9 +16,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from etid.circuits.display import per_cent
-from etid.circuits.overview import Overviewed
 from etid.precision import Module, namespace
+from etid.printing import Overviewed, per_cent
 from etid.signals.transfer import AnyArray
 
 

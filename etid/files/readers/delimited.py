@@ -26,7 +26,6 @@ from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 
-from etid.circuits.display import several
 from etid.files.channel import (
     Contents,
     by_place,
@@ -36,6 +35,7 @@ from etid.files.channel import (
     spooled,
     with_unit,
 )
+from etid.printing import several
 from etid.recordings.recording import RecordingError
 
 ROWS = 1 << 16  # rows of text in memory at a time
