@@ -9,8 +9,8 @@ import scipy.stats
 
 import etid
 from etid import cli
-from etid.circuits.display import quantity
 from etid.estimators.element_limits import truncated, within
+from etid.printing import quantity
 from etid.recordings.remarks import Remark
 from etid.results.fit import Support
 from etid.results.verdicts import verdict

@@ -8,7 +8,7 @@ import re
 import pytest
 
 import etid
-from etid.circuits.display import as_symbol, per_cent, quality, rounded, several, significant
+from etid.printing import as_symbol, per_cent, quality, rounded, several, significant
 from etid.report.html import Section, Table
 
 

@@ -20,7 +20,7 @@ jax.config.update("jax_enable_x64", True)
 import etid
 from etid import cli
 from etid.report.study import summary
-from etid.results.fits_columns import described
+from etid.results.columns import described
 from etid.results.verdicts import verdicts_of
 
 folder, make_page = pathlib.Path(sys.argv[1]), sys.argv[2]

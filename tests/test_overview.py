@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 
 import etid
-from etid.circuits.display import between, quantity
-from etid.circuits.overview import ROWS, Overview
 from etid.display.state import Change
+from etid.printing import ROWS, Overview, between, quantity
 from etid.recordings.remarks import Remark
+from etid.results.columns import described
 from etid.results.data import MeasuredImpedance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
 from etid.results.fit import Support
-from etid.results.fits_columns import described
 from etid.results.verdicts import verdict
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound

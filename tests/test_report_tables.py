@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.circuits.display import PREFIXES
+from etid.printing import PREFIXES
 from etid.report import tables
 from tests import pictures
 

@@ -35,9 +35,9 @@ from benchmarks.paper.tables import (
     identify,
     resistor_errors,
 )
-from etid.circuits.display import DISPLAY, as_symbol, several, significant
 from etid.plotting import figure_of
 from etid.plotting.style import save
+from etid.printing import as_symbol, scaled, several, significant
 from etid.recordings.replacing import replace_text
 from etid.report.html import Picture, Section, Table, write_page
 from etid.simulation.published import FINGERTIPS, RRSE, TABLE_1, TABLE_4
@@ -84,7 +84,7 @@ def table_fingertips(outcomes: Sequence[Outcome], condition: str) -> Table:
     rows = []
     units = etid.SkinRC.units()
     for name in ORDER:
-        scale, symbol = DISPLAY[units[name]]
+        scale, symbol = scaled(units[name])
         typical, *limits = (value / scale for value in FINGERTIPS[condition][name])
         label = f"{as_symbol(name)} [{symbol}]"
         paper = significant(typical, 3), "", "", _span(*limits)

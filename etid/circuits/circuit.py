@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.diffusion import diffusion
-from etid.circuits.display import DISPLAY
 from etid.circuits.elements import (
     Exponent,
     Farad,
@@ -32,8 +31,8 @@ from etid.circuits.elements import (
     resistor,
 )
 from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
-from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.precision import Module, in_float64, namespace, unmasked
+from etid.printing import Overview, Overviewed, element_rows
 from etid.signals.transfer import AnyArray, frequency_variable, widened
 
 _Same = TypeVar("_Same", bound="AbstractCircuit")
@@ -58,8 +57,8 @@ def parameter(unit: str, *, typical: float) -> Any:
     Raises:
         ValueError: The unit is not known.
     """
-    if unit not in DISPLAY:
-        raise ValueError(f"unit {unit!r} is not known; use one of {sorted(DISPLAY)}")
+    if unit not in (known := dimensions(1.0)):
+        raise ValueError(f"unit {unit!r} is not known; use one of {sorted(known)}")
     return eqx.field(
         default=typical, converter=_numbers, metadata={"unit": unit, "typical": typical}
     )

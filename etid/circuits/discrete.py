@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import rounded, significant
 from etid.circuits.impedance import divider
 from etid.circuits.lookup import circuit
-from etid.circuits.overview import Overview, Overviewed
 from etid.precision import Module, array_function, in_float64, is_traced, namespace, unmasked
+from etid.printing import Overview, Overviewed, rounded, significant
 from etid.signals.filtering import StateSpace, companion, simulate
 from etid.signals.transfer import AnyArray, as_complex, delay_variable
 

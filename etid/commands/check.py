@@ -11,9 +11,9 @@ from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 
-from etid.circuits.display import several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.identify.options import instrument_of
+from etid.printing import several
 from etid.recordings import hdf5
 from etid.recordings.causes import how_shifted, sizes
 from etid.recordings.errors import RecordingError

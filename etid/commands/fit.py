@@ -3,15 +3,11 @@
 import argparse
 import concurrent.futures
 import contextlib
-import dataclasses
 import pathlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
-
-from etid.circuits.display import several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.commands.circuits import add_circuit
 from etid.estimators import registry
@@ -25,7 +21,7 @@ from etid.recordings.resistance import number
 from etid.results.driver import Order
 from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
-from etid.results.verdicts import USABLE, message, own_part
+from etid.results.verdicts import USABLE
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -214,7 +210,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
             )
     status = DONE if outcome.fits.fit.usable.any() else WRONG_DATA
     files = {"source": arguments.source, "target": arguments.target}
-    return Outcome(_summary(outcome), {**files, **_data(outcome)}, status)
+    alone = len(outcome.fits) == 1 and status == DONE
+    text = f"{outcome}\n\n{outcome.fits[0]}" if alone else str(outcome)
+    return Outcome(text, {**files, **_data(outcome)}, status)
 
 
 def after_interrupt(arguments: argparse.Namespace) -> str:
@@ -239,37 +237,6 @@ def _executor(arguments: argparse.Namespace) -> Iterator[concurrent.futures.Exec
             yield executor
     else:
         yield None
-
-
-def _summary(outcome: StudyFits) -> str:
-    """Text for people: the fits and drivers, and the recordings that cannot be used."""
-    fits = outcome.fits
-    lines = [dataclasses.replace(fits._medians(), then=(outcome._drivers(),)).text()]
-    if len(fits) == 1 and fits.fit.usable.all():
-        lines += ["", str(fits[0])]
-    failed = np.flatnonzero(~fits.fit.usable)
-    if failed.size:
-        lines += ["", f"unusable: {several(failed.size, 'recording')}"]
-    listed = failed[:20]
-    for verdict in dict.fromkeys(fits.verdicts[listed].tolist()):
-        same = [i for i in listed if fits.verdicts[i] == verdict]
-        paths, notes = fits.labels["path"][same].tolist(), fits.notes[same].tolist()
-        lines += _explained(verdict, paths, notes)
-    if failed.size > listed.size:
-        more = failed.size - listed.size
-        lines.append(f"and {more} more; the file of fits contains a note for each fit")
-    return "\n".join(lines)
-
-
-def _explained(verdict: str, paths: Sequence[str], notes: Sequence[str]) -> list[str]:
-    """Lines on recordings with the same verdict; what their notes have in common is said once."""
-    if len(paths) == 1:
-        return [f"{paths[0]}: {verdict}. {' '.join(notes[0].split())}"]
-    own = [own_part(verdict, note) for note in notes]
-    if len(set(own)) == 1:
-        return [f"{verdict}. {message(verdict)} {own[0]}".rstrip(), *(f"  {one}" for one in paths)]
-    each = [f"  {path}: {text}".rstrip(": ") for path, text in zip(paths, own, strict=True)]
-    return [f"{verdict}. {message(verdict)}", *each]
 
 
 def _data(outcome: StudyFits) -> dict[str, Any]:

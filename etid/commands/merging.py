@@ -3,8 +3,8 @@
 import argparse
 import pathlib
 
-from etid.circuits.display import several
 from etid.commands import Outcome
+from etid.printing import several
 from etid.recordings.hdf5 import merge_files
 from etid.recordings.replacing import HDF5
 

@@ -4,8 +4,8 @@ import argparse
 import json
 import pathlib
 
-from etid.circuits.display import several
 from etid.commands import Outcome
+from etid.printing import several
 from etid.recordings.replacing import HDF5, replace_text
 from etid.simulation import scenes
 from etid.simulation.displays import ELECTRODES, write_stream

@@ -6,7 +6,6 @@ import contextlib
 import pathlib
 import sys
 
-from etid.circuits.display import several
 from etid.commands import Outcome
 from etid.display.controller import Controller
 from etid.display.loop import follow
@@ -16,6 +15,7 @@ from etid.display.tracker import Tracker
 from etid.display.view import PORT, LiveView
 from etid.identify.driver import identify_driver
 from etid.plotting.layout import read_layout
+from etid.printing import several
 from etid.simulation.calibration import calibrations_in
 
 

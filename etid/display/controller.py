@@ -57,14 +57,13 @@ import scipy
 from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import number, rounded, several
-from etid.circuits.overview import Overview, Overviewed
 from etid.display.current import CurrentModel
 from etid.display.state import ElectrodeState, TrackerState
 from etid.display.tracker import Tracker, for_each
 from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.arguments import number_of, require
 from etid.precision import Kept, in_float64
+from etid.printing import Overview, Overviewed, number, rounded, several
 from etid.results.verdicts import counts, usable
 from etid.solvers.matrices import inverse_of_few
 

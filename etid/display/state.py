@@ -7,8 +7,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from etid.circuits.display import rounded, several
-from etid.circuits.overview import Overview, Overviewed
 from etid.display.alarms import score_of
 from etid.display.noise import Noise, directions
 from etid.display.pulse_fit import GainModel, Pulse
@@ -17,6 +15,7 @@ from etid.estimators.online import METHOD
 from etid.likelihood.linear import diagonal, inverse
 from etid.likelihood.scores import doubt
 from etid.precision import Module, array_function
+from etid.printing import Overview, Overviewed, rounded, several
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, counted, usable, verdict_names, verdicts_of

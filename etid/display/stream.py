@@ -16,9 +16,9 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import several
 from etid.display.clock import Clock
 from etid.display.stimulator import PAUSE
+from etid.printing import several
 from etid.recordings.errors import RecordingError
 from etid.recordings.untrusted import guarded
 

@@ -51,8 +51,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit, impedance_at
-from etid.circuits.display import per_cent, several
-from etid.circuits.overview import Overview, Overviewed
 from etid.display.alarms import limit
 from etid.display.clock import Clock
 from etid.display.gain_bands import unloaded_bands
@@ -75,13 +73,14 @@ from etid.identify.arguments import circuit_of, number_of, require
 from etid.identify.fitting import known_at
 from etid.identify.planning import explained
 from etid.precision import Kept, in_float64, unmasked, untraced
+from etid.printing import Overview, Overviewed, per_cent, several
 from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
+from etid.results.columns import described
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import IdentificationError
 from etid.results.fits import Fits
-from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
 
 # A window has faults that a record of several periods has not, and others have other remedies.

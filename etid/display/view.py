@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import DISPLAY, first_of, heading
 from etid.display.controller import Controller
 from etid.display.stimulator import SENT, Output
 from etid.plotting.layout import Layout, like_fingertip
 from etid.precision import untraced
+from etid.printing import first_of, heading, scaled
 from etid.recordings.errors import in_one_line, install
 from etid.results.verdicts import USABLE, verdict_names
 
@@ -91,7 +91,7 @@ class LiveView:
         margin = (high[-1] - high[0]) // 2 + 1
         self._part = slice(max(high[0] - margin, 0), high[-1] + margin)
         units = {name: circuit.units()[name] for name in circuit.names()}
-        self._scale = np.array([DISPLAY[unit][0] for unit in units.values()])
+        self._scale = np.array([scaled(unit)[0] for unit in units.values()])
         samples = np.arange(of.size)[self._part]
         dtype = [
             ("pulse", int), ("missing", int), ("late", int), ("slowest", float), ("end", "S400"),

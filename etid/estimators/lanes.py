@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import several
 from etid.precision import Module, namespace
+from etid.printing import several
 from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from etid.circuits.display import rounded, several
 from etid.files.channel import UNITS, Channel, located, parse_unit
 from etid.files.clock import sample_rate
 from etid.files.mapping import KINDS, PAUSES, Plan, Signal
+from etid.printing import rounded, several
 from etid.recordings.fields import LABELS, SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, RecordingError
 from etid.recordings.splitting import split

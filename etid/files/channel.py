@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from etid.circuits.display import first_of, several
+from etid.printing import first_of, several
 from etid.recordings import errors, limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import unwritable

@@ -4,9 +4,9 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from etid.circuits.display import rounded, several
 from etid.files.channel import Channel, located
 from etid.files.mapping import Plan
+from etid.printing import rounded, several
 from etid.recordings.recording import RecordingError
 
 QUARTZ = 1e-4  # largest relative error of a quartz clock, so of a measured rate

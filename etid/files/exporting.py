@@ -6,7 +6,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import h5py
@@ -16,14 +16,14 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.netlist import circuit_string, netlist
 from etid.files.channel import listed
 from etid.precision import in_float64
-from etid.recordings import limits
 from etid.recordings.errors import RecordingError, located, optional
 from etid.recordings.replacing import replace_text, replacing
 from etid.recordings.untrusted import attribute, translated
-from etid.results.fit import Fit, Limited
-from etid.results.fits import DESCRIBED, SCHEMA, VERSION, Fits
-from etid.results.fits_columns import LIMITS, long_form
-from etid.results.hdf5_table import REMEDY, Table, check_same_length, opened_table
+from etid.results.columns import long_form
+from etid.results.fit import Fit
+from etid.results.fits import Fits
+from etid.results.fits_file import SCHEMA, VERSION, columns_in, elements_in
+from etid.results.hdf5_table import REMEDY, Table, opened_table
 
 ROWS = 1 << 16  # fits in memory at a time
 CIRCUITS = (".cir", ".json")
@@ -68,45 +68,20 @@ def export_fits(
         located(os.fspath(target)),
         replacing(target) as partial,
     ):
-        names = _elements(table)
-        columns = _columns(table, names)
-        if not all:
-            more = {f"{name}_change" for name in (*names, "amplitude")}
-            more |= {"rrse", "chi2", "steps", "remarks", *LIMITS}
-            columns = {name: column for name, column in columns.items() if name not in more}
+        names = elements_in(table)
+        wanted = ("always", "all") if all else ("always",)
+        columns = {
+            name: stored
+            for name, (column, stored) in columns_in(table, names).items()
+            if column.shown in wanted
+        }
         units = {name: _units(column, table) for name, column in columns.items()}
         of = {name: units[name] or "1" for name in names}
-        parts = _parts(table, columns, of)
+        parts = _parts(table, columns)
         if long:
             parts = (long_form(part, of) for part in parts)
         about = {name: table.text(name) for name in ("circuit", "method", "etid_version")}
         TABLES[suffix](parts, units, about, partial)
-
-
-def _elements(table: Table) -> list[str]:
-    """Names of the elements."""
-    parameters = table.attribute("parameters")
-    names = parameters if isinstance(parameters, list) else [parameters]
-    if not all(isinstance(name, str) for name in names) or len(names) > limits.NAMES:
-        raise RecordingError(
-            f"is {parameters!r}, must be names", file=table.name, field="parameters",
-            remedy=REMEDY,
-        )  # fmt: skip
-    return [str(name) for name in names]
-
-
-def _columns(table: Table, names: Sequence[str]) -> dict[str, h5py.Dataset]:
-    """The columns of `Fits.table()` as HDF5 datasets that are not read yet."""
-    elements = [name + ending for name in names for ending in ("", "_stderr")]
-    elements += [f"{name}_change" for name in (*names, "amplitude")]
-    quality = {"rrse": "number", "chi2": "number", "steps": "integer", "verdict": "text",
-               "remarks": "text", "note": "text"}  # fmt: skip
-    kinds = DESCRIBED | dict.fromkeys(elements, "number") | quality
-    columns = {name: table.column(name, kind) for name, kind in kinds.items()}
-    if "outside" in table:  # only for fits with bounds
-        columns |= {name: table.column(name, "number", (len(names),)) for name in LIMITS}
-    check_same_length(table, columns)
-    return columns
 
 
 def _units(column: h5py.Dataset, table: Table) -> str | None:
@@ -118,21 +93,11 @@ def _units(column: h5py.Dataset, table: Table) -> str | None:
     return unit
 
 
-def _parts(
-    table: Table, columns: dict[str, h5py.Dataset], units: Mapping[str, str]
-) -> Iterator[dict[str, np.ndarray]]:
-    """The columns in parts of `ROWS` rows; one part without rows if there are no fits.
-
-    What the bounds do is a text, in place of the columns of the bounds.
-    """
+def _parts(table: Table, columns: dict[str, h5py.Dataset]) -> Iterator[dict[str, np.ndarray]]:
+    """The columns in parts of `ROWS` rows; one part without rows if there are no fits."""
     for start in range(0, max(1, len(columns["path"])), ROWS):
         rows = slice(start, start + ROWS)
-        part = {name: table.read(column, rows) for name, column in columns.items()}
-        if "outside" in part:
-            bounds = zip(*(part.pop(name) for name in LIMITS), strict=True)
-            part["at_bound"] = np.array([Limited(*of).text(units) for of in bounds], str)
-            part["note"] = part.pop("note")  # the last one
-        yield part
+        yield {name: table.read(column, rows) for name, column in columns.items()}
 
 
 _Part = dict[str, np.ndarray]

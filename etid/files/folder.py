@@ -17,12 +17,12 @@ from typing import Any
 
 import tomli_w
 
-from etid.circuits.display import several
 from etid.files.assemble import Imported
 from etid.files.channel import listed
 from etid.files.importing import channels_of, converted, other_file
 from etid.files.labels import further_files, labelled
 from etid.files.mapping import CHANNELS
+from etid.printing import several
 from etid.recordings.errors import RecordingError
 from etid.recordings.fields import LABELS
 from etid.recordings.replacing import replacing

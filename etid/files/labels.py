@@ -6,9 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from etid.circuits.display import several
 from etid.files.channel import located
 from etid.files.pattern import pattern
+from etid.printing import several
 from etid.recordings.errors import RecordingError
 from etid.recordings.resistance import resistance
 from etid.recordings.tables import rows_of

@@ -16,7 +16,8 @@ from etid.files.channel import UNITS, chosen, listed, parse_unit
 from etid.files.pattern import pattern
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, located
-from etid.recordings.fields import DECLARED, LABELS, SIGNALS, check_names, real, tidy_path
+from etid.recordings.fields import DECLARED, LABELS, SIGNALS, real, tidy_path
+from etid.recordings.labels import check_names
 
 CHANNELS = (*SIGNALS, "time")
 FIELDS = (*DECLARED, "scale", "split")

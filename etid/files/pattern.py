@@ -3,7 +3,8 @@
 import re
 
 from etid.recordings.errors import RecordingError, located
-from etid.recordings.fields import LABELS, check_names
+from etid.recordings.fields import LABELS
+from etid.recordings.labels import check_names
 
 
 def pattern(text: str, more: tuple[str, ...] = ()) -> re.Pattern[str]:

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.circuits.display import several
 from etid.files.channel import listed, located
 from etid.files.readers.delimited import Dialect, likely_dialect
+from etid.printing import several
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, optional, require_file
 

@@ -8,11 +8,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.circuits.display import several
 from etid.circuits.lookup import circuit
-from etid.circuits.overview import Overviewed
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import Known
+from etid.printing import Overviewed, several
 from etid.recordings.errors import not_recorded
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study

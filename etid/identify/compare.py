@@ -8,13 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import per_cent, rounded, several
-from etid.circuits.overview import Overview, Overviewed
 from etid.identify.arguments import fed, given_circuit
 from etid.identify.arguments import recordings as list_of
 from etid.identify.predict import predict
 from etid.identify.residual import whitened
 from etid.precision import in_float64
+from etid.printing import Overview, Overviewed, per_cent, rounded, several
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.study import Study

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import rounded
 from etid.estimators.estimator import AbstractEstimator, serving
 from etid.estimators.lanes import AlignedSamples, Bins, Harmonics, stacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method, named
@@ -25,6 +24,7 @@ from etid.identify.options import (
 )
 from etid.identify.planning import explained
 from etid.precision import in_float64
+from etid.printing import rounded
 from etid.recordings.causes import LOG, log_changes
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from jaxtyping import Complex
 from tqdm import tqdm
 
-from etid.circuits.display import several
 from etid.estimators.element_limits import checked_limits
 from etid.estimators.element_prior import checked
 from etid.estimators.lanes import stacked
@@ -26,6 +25,7 @@ from etid.identify.spectrum import chain_of
 from etid.identify.spectrum_fit import METHOD, Told, fit_spectrum
 from etid.identify.study import table
 from etid.precision import in_float64, one_thread
+from etid.printing import several
 from etid.recordings.errors import RecordingError
 from etid.recordings.fields import LABELS
 from etid.recordings.remarks import Remark

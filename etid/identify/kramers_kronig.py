@@ -20,9 +20,8 @@ import numpy.typing as npt
 import scipy
 from jaxtyping import Complex, Float
 
-from etid.circuits.display import per_cent, rounded, several
-from etid.circuits.overview import Overview, Overviewed
 from etid.precision import in_float64, unmasked
+from etid.printing import Overview, Overviewed, per_cent, rounded, several
 
 MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
 EXACT = 1e-4  # relative residual that is as good as none

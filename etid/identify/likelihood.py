@@ -16,8 +16,6 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import several, significant
-from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent, unstacked
@@ -39,6 +37,7 @@ from etid.likelihood.load import Load, Near
 from etid.likelihood.own_prior import OwnPrior
 from etid.likelihood.starts import starts
 from etid.precision import Module, array_function, in_float64, is_traced, namespace
+from etid.printing import Overview, Overviewed, several, significant
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import MEASURED_CURRENT, MeasuredCurrent
 from etid.results.fit import Fit

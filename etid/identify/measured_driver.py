@@ -17,10 +17,10 @@ import scipy.optimize
 from jaxtyping import Complex, Float
 
 from etid.circuits.discrete import Filter
-from etid.circuits.display import several
 from etid.identify.arguments import LARGEST_ORDER, number_of
 from etid.likelihood.noise import misses
 from etid.precision import array_function, in_float64, unmasked
+from etid.printing import several
 from etid.recordings.errors import RecordingError
 from etid.results.driver import Calibration, ContinuousDriver
 from etid.results.feed import SourceImpedance

@@ -15,13 +15,13 @@ from jaxtyping import Bool, Float
 
 from etid.circuits.branches import in_order
 from etid.circuits.circuit import AbstractCircuit, too_steep
-from etid.circuits.display import several
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.element_prior import Known
 from etid.identify.kramers_kronig import EXACT, FAIL, MISFIT_CHI2, KramersKronig
 from etid.identify.spectrum import ROUNDING, PassiveFit, Spectrum
 from etid.likelihood.linear import LevenbergMarquardt, NormalEquations, taken
 from etid.precision import array_function
+from etid.printing import several
 from etid.recordings.remarks import Remark
 from etid.results.data import MeasuredImpedance
 from etid.results.fit import Fit, Support, complex_rrse

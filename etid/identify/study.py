@@ -20,11 +20,11 @@ from etid.identify.planning import Load, batches, failed_fit
 from etid.precision import in_float64
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
+from etid.results.columns import described
 from etid.results.driver import Driver, Order
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
 from etid.results.fit import Fit, IdentificationError
 from etid.results.fits import Fits, concatenated
-from etid.results.fits_columns import described
 from etid.results.instrument import Instrument
 from etid.results.study_fits import PLAUSIBLE, StudyFits
 from etid.selection.common import common, deserves

@@ -22,7 +22,6 @@ from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import PREFIXES, per_cent, several
 from etid.estimators.estimator import NOISE
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
@@ -31,6 +30,7 @@ from etid.identify.inexact import discrepancy
 from etid.identify.posterior import given
 from etid.plotting.bands import fitted, used
 from etid.plotting.style import BLUE, INK, VIOLET, plain_ticks
+from etid.printing import PREFIXES, per_cent, several
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import DISPLAY, per_cent, several
 from etid.plotting.style import (
     BLUE,
     COLOURS,
@@ -27,8 +26,9 @@ from etid.plotting.style import (
     symbol,
     titled,
 )
-from etid.recordings.contents import ranked
-from etid.recordings.fields import LABELS, check_names
+from etid.printing import per_cent, scaled, several
+from etid.recordings.fields import LABELS
+from etid.recordings.labels import check_names, ranked
 from etid.results.fits import Fits
 from etid.results.posterior import Posterior, Profile
 from etid.results.verdicts import counted
@@ -72,7 +72,7 @@ def draw_fits(canvas: Canvas, fits: Fits, by: Sequence[str]) -> np.ndarray:
     beside_points = _distinct(fits, by) if room else ""
     hollow = False
     for axis, (name, unit) in zip(axes, units.items(), strict=True):
-        scale = DISPLAY[unit][0]
+        scale = scaled(unit)[0]
         values = np.asarray(getattr(fits.circuit, name)) / scale
         errors = np.asarray(getattr(fits.stderr, name)) / scale
         errors = np.where(np.isfinite(errors), errors, 0.0)
@@ -198,7 +198,7 @@ def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
     count = len(units)
     grid = canvas(count, count, (2.4 * count + 0.6, 2.2 * count + 0.4), matrix=True)
     narrow = grid[0, 0].figure.get_figwidth() < NARROW * count
-    scales = np.array([DISPLAY[unit][0] for unit in units.values()])
+    scales = np.array([scaled(unit)[0] for unit in units.values()])
     labels = [symbol(name, unit) for name, unit in units.items()]
     draws = np.asarray(posterior.draws.values()).T / scales[:, None]
     centre = np.asarray(posterior.circuit.values()) / scales
@@ -259,7 +259,7 @@ def _ellipse(
 def draw_profile(canvas: Canvas, profile: Profile) -> np.ndarray:
     """The deviance over the values of an element, and the parabola of the standard error."""
     (axis,) = axes = canvas(1, 1, (5.2, 3.6)).ravel()
-    scale = DISPLAY[profile.unit][0]
+    scale = scaled(profile.unit)[0]
     values = profile.values / scale
     limit = statistics.NormalDist().inv_cdf((1 + LEVEL) / 2) ** 2
     axis.plot(values, profile.deviance, color=BLUE, lw=1.5, label="other parameters fitted again")

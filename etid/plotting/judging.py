@@ -7,7 +7,6 @@ from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from etid.circuits.display import scaled
 from etid.plotting.bands import CLEAR, Bands, bands, continuous, used
 from etid.plotting.impedances import POINTS, Bode
 from etid.plotting.style import (
@@ -24,6 +23,7 @@ from etid.plotting.style import (
     nth,
     without_elements,
 )
+from etid.printing import scaled
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.data import MeasuredImpedance

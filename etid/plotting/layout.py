@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import several
-from etid.circuits.overview import Overview, Overviewed
 from etid.precision import unmasked
+from etid.printing import Overview, Overviewed, several
 from etid.recordings.errors import RecordingError, located, optional, require_file
 from etid.recordings.tables import rows_of
 

@@ -6,7 +6,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import LogNorm
 
-from etid.circuits.display import DISPLAY, several
 from etid.plotting.layout import Layout
 from etid.plotting.style import (
     INK,
@@ -23,6 +22,7 @@ from etid.plotting.style import (
     symbol,
     titled,
 )
+from etid.printing import scaled, several
 from etid.results.fits import Fits
 from etid.results.verdicts import USABLE
 
@@ -53,7 +53,7 @@ def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.nda
     place = layout.place(fits.labels["electrode"])
     keys = groups_of(fits)
     groups = sorted(set(keys))
-    values = np.asarray(getattr(fits.circuit, element)) / DISPLAY[units[element]][0]
+    values = np.asarray(getattr(fits.circuit, element)) / scaled(units[element])[0]
     good = fits.fit.usable & drawable(values)
     norm = LogNorm(*(_round(values[good]) if good.any() else (1.0, 10.0)))
     bad = sorted({str(verdict) for verdict in fits.verdicts[~good]} - {*USABLE})

@@ -4,7 +4,6 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
-from etid.circuits.display import heading, scaled
 from etid.identify.predict import predict
 from etid.plotting.bands import continuous
 from etid.plotting.by_frequency import by_frequency, draw_by_frequency, sample_std
@@ -22,6 +21,7 @@ from etid.plotting.style import (
     typeset,
     without_elements,
 )
+from etid.printing import heading, quantity, scaled
 from etid.recordings.fields import LABELS
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
@@ -70,7 +70,7 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
         axes[-1, column].set(xlabel="time [ms]")
     labels = [f"{name}{NO_BREAK}{value}" for name in LABELS if (value := getattr(recording, name))]
     if recording.r_load is not None:
-        labels.append(f"calibration with {recording.r_load / 1e3:g} kΩ")
+        labels.append(f"calibration with {quantity(recording.r_load, 'ohm')}")
     titled(axes[0, 0], [plain(recording.path), plain(", ".join(labels))], beside=True)
     titled(axes[0, 1], ["one pulse"], beside=True)
     legend(axes)
@@ -94,7 +94,7 @@ def draw_calibration(canvas: Canvas, driver: Driver, recording: Recording) -> np
         )
     load = Resistor(recording.r_load)
     axes = _pulse_and_residual(canvas, driver, recording, driver, load)
-    about = f"driver of order {driver.order}, known load {recording.r_load / 1e3:g} kΩ"
+    about = f"driver of order {driver.order}, known load {quantity(recording.r_load, 'ohm')}"
     judged(axes[0], recording.path, driver, about)
     return axes
 

@@ -25,7 +25,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from etid.circuits.display import heading, rounded
+from etid.printing import heading, rounded
 from etid.recordings.replacing import replacing
 from etid.results.data import AnyAxes, Size
 from etid.results.driver import Driver

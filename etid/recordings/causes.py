@@ -5,7 +5,7 @@ import logging
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import rounded, several
+from etid.printing import rounded, several
 from etid.recordings.preflight import Inspected
 from etid.signals.lags import lags_of, shifted, whole_lag
 

@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import functools
 import os
-import re
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -16,10 +15,11 @@ import h5py
 import numpy as np
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
-from etid.circuits.display import several
+from etid.printing import several
 from etid.recordings import limits, schema
 from etid.recordings.errors import near_miss
 from etid.recordings.fields import SIGNALS, Field, Metadata, metadata_from, tidy_path
+from etid.recordings.labels import natural
 from etid.recordings.recording import (
     AbstractSource,
     Layout,
@@ -432,18 +432,3 @@ class Scan:
         what = "is not in the file" if kind is None else f"is a {kind or 'broken'} recording"
         remedy = "Name the HDF5 path of a group with kind='calibration'"
         self._report(path, "calibration", f"{calibration!r} {what}", remedy)
-
-
-def natural(name: str) -> list[tuple[int, str]]:
-    """Sorting key that orders digits by their number: 2 before 10."""
-    parts = re.split(r"([0-9]+)", name)
-    # Python does not convert numbers of more than 4300 digits.
-    numbers = (part.isdecimal() and len(part) < 1000 for part in parts)
-    return [(int(p), "") if whole else (-1, p) for p, whole in zip(parts, numbers, strict=True)]
-
-
-def ranked(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The different names, 2 before 10, and for each name its place among them."""
-    found, place = np.unique(names, return_inverse=True)
-    order = np.array(sorted(range(found.size), key=lambda row: natural(str(found[row]))), int)
-    return found[order], np.argsort(order)[place]

@@ -8,29 +8,17 @@ change.
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from etid.recordings import limits
-from etid.recordings.errors import RecordingError, near_miss
+from etid.recordings.errors import RecordingError
+from etid.recordings.labels import check_names, text
 from etid.recordings.resistance import resistance
 from etid.signals.low_pass import Filters, LowPass
 
 Type = Literal["text", "paths", "label", "number", "range", "samples"]
-
-
-def text(field: str, value: object) -> str:
-    """A label as text; integers become their decimal digits."""
-    if isinstance(value, int | np.integer) and not isinstance(value, bool):
-        value = int(value)
-    elif not isinstance(value, str):
-        raise RecordingError(f"is {value!r}, must be text or an integer", field=field)
-    label = str(value)
-    if "\0" in label or any("\ud800" <= character <= "\udfff" for character in label):
-        raise RecordingError(f"{label!r} cannot be stored as UTF-8 text", field=field)
-    return label
 
 
 def real(field: str, value: object) -> float:
@@ -65,7 +53,6 @@ def plain(item: Any) -> Any:
 
 KINDS = ("calibration", "loaded")
 
-Label = str | int | np.integer
 Place = Literal["file attribute", "group attribute", "dataset", "dataset attribute"]
 
 
@@ -409,28 +396,3 @@ def metadata_from(*, path: str = "", **fields: Any) -> Metadata:
             raise RecordingError("is not given", field=name, remedy=f"Add {field.expects}")
     known = {name: DECLARED[name].checked(value) for name, value in fields.items()}
     return Metadata(path=tidy_path(path), **known)
-
-
-def check_names(given: Mapping[str, Any], known: Sequence[str], what: str, of: str = "") -> None:
-    """Raise an error if a name is not known.
-
-    Args:
-        given: Values by name.
-        known: Known names.
-        what: Word for these names in the error, such as "label".
-        of: Text before the name in the error, such as "v_th.".
-    """
-    for name in given:
-        if name not in known:
-            near = near_miss(name, known)
-            raise RecordingError(
-                f"is no {what}{f', did you mean {near}?' if near else ''}",
-                field=f"{of}{name}",
-                remedy=f"Use one of {', '.join(known)}",
-            )
-
-
-def wanted_labels(given: Mapping[str, Any], known: Sequence[str]) -> dict[str, str]:
-    """Labels for a choice of recordings or fits, as text; labels that are None are ignored."""
-    check_names(given, known, "label")
-    return {name: text(name, value) for name, value in given.items() if value is not None}

@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from jaxtyping import Float
 
-from etid.circuits.display import SYMBOLS, several
-from etid.circuits.overview import Overview, Overviewed
 from etid.precision import unmasked
+from etid.printing import UNITS, Overview, Overviewed, several
 from etid.recordings.errors import RecordingError as RecordingError
 from etid.recordings.errors import located, not_recorded
 from etid.recordings.fields import (
@@ -295,7 +294,7 @@ class Recording(Overviewed, AbstractFields):
                 numbers = field.type in ("number", "range")
                 items = value if isinstance(value, tuple) else (value,)
                 text = " … ".join(f"{one:g}" for one in items) if numbers else ", ".join(items)
-                rows.append((name, text, SYMBOLS.get(field.unit, field.unit)))
+                rows.append((name, text, UNITS.get(field.unit, (0, field.unit))[1]))
         return Overview(f"Recording {self.path!r}", rows)
 
     def __repr__(self) -> str:

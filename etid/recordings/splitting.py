@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from etid.circuits.display import several
+from etid.printing import several
 from etid.recordings.errors import RecordingError
 from etid.signals.pulse_train import find_pulses
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from etid.circuits.display import several
-from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.precision import unmasked
-from etid.recordings.fields import LABELS, Label, Metadata, wanted_labels
+from etid.printing import ROWS, Overview, Overviewed, several
+from etid.recordings.fields import LABELS, Metadata
+from etid.recordings.labels import Label, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
 
 

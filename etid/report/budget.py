@@ -5,8 +5,8 @@ import dataclasses
 
 import numpy as np
 
-from etid.circuits.display import as_symbol
 from etid.identify.driver import with_harmonics
+from etid.printing import as_symbol
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.study import Study

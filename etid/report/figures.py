@@ -13,7 +13,6 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from etid.circuits.display import DISPLAY
 from etid.plotting import figure_of
 from etid.plotting.layout import Layout
 from etid.plotting.maps import BY, groups_of
@@ -31,7 +30,8 @@ from etid.plotting.style import (
     svg,
     symbol,
 )
-from etid.recordings.contents import ranked
+from etid.printing import scaled
+from etid.recordings.labels import ranked
 from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
@@ -67,7 +67,7 @@ def distributions(fits: Fits) -> bytes:
 
 def _values(fits: Fits, name: str, unit: str) -> Float[np.ndarray, " fit"]:
     """An element of all fits in its scaled unit."""
-    return np.asarray(getattr(fits.circuit, name)) / DISPLAY[unit][0]
+    return np.asarray(getattr(fits.circuit, name)) / scaled(unit)[0]
 
 
 def _widen(axis: Axes, low: float, high: float) -> None:

@@ -15,10 +15,10 @@ from typing import Any
 import etid.estimators.online
 import etid.identify.jointly
 import etid.nonlinear.identify  # these modules describe their methods
-from etid.circuits.display import as_symbol, per_cent, quantity, several
 from etid.estimators.estimator import Description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, described
 from etid.likelihood.driver import MAX_STEPS
+from etid.printing import as_symbol, per_cent, quantity, several
 from etid.report.html import Section, Table, template
 from etid.results.driver import ContinuousDriver
 from etid.results.fits import AND, Fits
@@ -146,7 +146,7 @@ def succeeded(fits: Fits) -> str:
     if len(fits) == 1:
         return f"The fit is {'' if good else 'unusable: '}{fits.verdicts[0]}."
     are = "is" if good == 1 else "are"
-    share = f"{several(good, 'fit')} ({100 * good / len(fits):.1f} %)"
+    share = f"{several(good, 'fit')} ({per_cent(good / len(fits), 3)})"
     inexact = f", {approximate} of them approximate" if approximate else ""
     return f"{share} {are} usable{inexact}; only these enter medians and spreads."
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import as_symbol, several
 from etid.plotting.layout import FINGERTIP, Layout
 from etid.plotting.style import listed
 from etid.precision import in_float64
+from etid.printing import as_symbol, several
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.study import Study
 from etid.report import figures

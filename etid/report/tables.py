@@ -12,18 +12,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from etid.circuits.display import (
-    as_symbol,
-    between,
-    first_of,
-    heading,
-    plus_minus,
-    scaled,
-    significant,
-)
+from etid.printing import as_symbol, between, first_of, heading, plus_minus, scaled, significant
 from etid.recordings.fields import LABELS
 from etid.report.html import Table
 from etid.report.methods import words
+from etid.results.columns import named
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.fits import Fits
 from etid.results.verdicts import message, own_part
@@ -250,31 +243,22 @@ def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
         good = np.flatnonzero(fits.fit.usable)
         every = np.linspace(0, good.size - 1, SINGLE - bad.size).round().astype(int)
         some = fits.take(np.union1d(bad, good[every]))
-    units = some.circuit.units()
+    table, units = some.table(), some.circuit.units()
     labels = [name for name in LABELS if len(set(map(str, fits.labels[name]))) > 1]
-    scales, heads = {}, ["recording", *labels, "verdict"]
-    columns = {name: np.asarray(getattr(some.circuit, name)) for name in units}
-    errors = {name: np.asarray(getattr(some.stderr, name)) for name in units}
+    heads = {"path": "recording"} | {name: name for name in labels}
+    shown = {head: [str(one) or "-" for one in table[name]] for name, head in heads.items()}
+    shown["verdict"] = table["verdict"].tolist()
     for name, unit in units.items():
-        usual = _typical(columns[name])
-        scales[name] = scaled(unit, usual)[0]
-        heads.append(heading(as_symbol(name), unit, usual))
-    rows = []
-    for i, verdict in enumerate(some.verdicts):
-        rows.append(
-            (
-                str(some.labels["path"][i]) or "-",
-                *(str(some.labels[name][i]) or "-" for name in labels),
-                str(verdict),
-                *(element(columns[name][i], errors[name][i], scales[name]) for name in units),
-                significant(float(some.chi2[i]), 3),
-                significant(100 * float(some.rrse[i])),
-                own_part(str(verdict), str(some.notes[i])),
-            )
-        )
-    heads += ["χ²", "RRSE [%]", "note"]
-    shown = _without_empty(heads, rows)
-    return Table(*shown, searchable=True, folded=len(rows) > 30, links=links)
+        usual = _typical(table[name])
+        scale = scaled(unit, usual)[0]
+        pairs = zip(table[name], table[f"{name}_stderr"], strict=True)
+        shown[heading(as_symbol(name), unit, usual)] = [element(*pair, scale) for pair in pairs]
+    for name, (column, *_) in named(units).items():
+        if column.heading and name in table:
+            shown[column.heading] = [column.text(float(one)) for one in table[name]]
+    shown["note"] = list(map(own_part, shown["verdict"], map(str, table["note"])))
+    found = _without_empty(list(shown), list(zip(*shown.values(), strict=True)))
+    return Table(*found, searchable=True, folded=len(some) > 30, links=links)
 
 
 def single(fits: Fits) -> Table:

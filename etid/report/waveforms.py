@@ -7,9 +7,9 @@ import pathlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from etid.circuits.display import as_symbol, significant
 from etid.plotting import figure_of
 from etid.plotting.style import svg
+from etid.printing import as_symbol, significant
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
@@ -112,7 +112,7 @@ def _predicted(
 def waveforms(found: StudyFits, study: Study | None, problem: str) -> Section:
     """Measured and predicted pulses of the worst fits; `problem` is that with the recordings."""
     text = (
-        "First unusable fits: for each verdict those with the largest χ². Then successful "
+        "First unusable fits: for each verdict those with the largest χ². Then usable "
         "fits with the largest χ² and with the largest standard error. One pulse of each."
     )
     heading, chosen = "Worst fits", worst(found.fits)

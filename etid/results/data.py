@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import Circuit
-from etid.circuits.display import rounded, several
-from etid.circuits.overview import Overview, Overviewed
+from etid.printing import Overview, Overviewed, rounded, several
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.instrument import Budget

@@ -12,10 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.circuits.display import per_cent, plus_minus, quality, rounded, several
 from etid.circuits.impedance import Quantity
-from etid.circuits.overview import Overview, Overviewed
 from etid.precision import Module, array_function, in_float64, namespace, untraced
+from etid.printing import Overview, Overviewed, per_cent, plus_minus, quality, rounded, several
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import texts
 from etid.recordings.study import Study

@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits.impedance import Quantity, divider, realise
-from etid.circuits.overview import Overview
 from etid.precision import Module, in_float64, namespace, untraced
+from etid.printing import Overview
 from etid.results.verdicts import RESULTS, Judged, verdict
 from etid.signals import modal
 from etid.signals.departure import Departure

@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import Circuit
 from etid.circuits.directions import ALIKE, DIRECTIONS, FAST, SPREAD, Direction, named
-from etid.circuits.display import quality, quantity, rounded, several
-from etid.circuits.overview import Overview, element_rows
 from etid.precision import Module, namespace
-from etid.recordings.remarks import Remark, texts, words
+from etid.printing import Overview, element_rows, per_cent, quality, quantity, rounded, several
+from etid.recordings.remarks import Remark, texts
+from etid.results.columns import described, table_of
 from etid.results.data import HasSource
 from etid.results.instrument import Effects, largest
 from etid.results.method_options import without_known
@@ -192,11 +192,6 @@ class Limited(Module):
         return f"Without bounds, {' and '.join(found)}." if found else ""
 
 
-def _signed(value: float) -> str:
-    """A number with two significant digits and its sign."""
-    return ("+" if value >= 0 else "") + rounded(value)
-
-
 class Fit(Judged, Presented, HasSource[Circuit]):
     """One identified circuit, or a batch of them along a leading axis.
 
@@ -308,25 +303,8 @@ class Fit(Judged, Presented, HasSource[Circuit]):
         Returns:
             Numbers and texts; arrays for a batch.
         """
-        names, stderr, change = self.circuit.names(), self.stderr, self.known_changes[0]
-        columns: dict[str, Any] = {}
-        for name in names:
-            columns[name] = getattr(self.circuit, name)
-            columns[f"{name}_stderr"] = getattr(stderr, name)
-        for i, name in enumerate((*names, "amplitude")):
-            columns[f"{name}_change"] = change[..., i]
-        remarks = np.vectorize(words, otypes=[object])(np.asarray(self.remarks))
-        columns |= {
-            "rrse": self.rrse,
-            "chi2": self.chi2,
-            "steps": self.steps,
-            "verdict": self.verdict,
-            "remarks": np.asarray(remarks).astype(str),
-        }
-        if self.limits is not None:
-            columns["at_bound"] = self._outside()
-        arrays = {name: np.asarray(column) for name, column in columns.items()}
-        return {name: one if one.ndim else one.item() for name, one in arrays.items()}
+        columns = table_of(self, {})
+        return {name: one if one.ndim else one.item() for name, one in columns.items()}
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the fit and the labels of its recording to an HDF5 file; `Fits.read` reads it.
@@ -335,7 +313,6 @@ class Fit(Judged, Presented, HasSource[Circuit]):
             ValueError: This is a batch.
         """
         from etid.results.fits import Fits  # a table of this class
-        from etid.results.fits_columns import described
 
         self.refuse_batch()
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self)
@@ -346,17 +323,13 @@ class Fit(Judged, Presented, HasSource[Circuit]):
         if np.ndim(self.rrse):
             raise ValueError("this is a batch of fits; take one of them, as in fits[0]")
 
-    def _outside(self) -> np.ndarray:
-        """A sentence on the elements that would lie outside their bounds, for each fit."""
+    @property
+    def outside(self) -> Any:
+        """A sentence on elements that would lie outside their bounds; an array for a batch."""
         units, shape = self.circuit.units(), np.shape(self.rrse)
         each = [jax.tree.map(operator.itemgetter(row), self.limits) for row in np.ndindex(shape)]
-        return np.array([one.text(units) if one else "" for one in each], str).reshape(shape)
-
-    @property
-    def outside(self) -> str:
-        """A sentence that names the elements that would lie outside their bounds; for one fit."""
-        self.refuse_batch()
-        return str(self._outside())
+        found = np.array([one.text(units) if one else "" for one in each], str).reshape(shape)
+        return found if found.ndim else str(found)
 
     @property
     def all_limits(self) -> Limited:
@@ -384,7 +357,8 @@ class Fit(Judged, Presented, HasSource[Circuit]):
             return ""
         names = *self.circuit.names(), "amplitude"
         known = [
-            f"{name} {_signed(100 * float(size))} ± {rounded(100 * float(error), 1)} %"
+            f"{name} {'+' if size >= 0 else ''}{rounded(100 * float(size))} ± "
+            f"{per_cent(float(error), 1)}"
             for name, size, error in zip(names, self.change, self.change_stderr, strict=True)
             if error < 1  # else the record does not determine it
         ]

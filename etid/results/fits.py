@@ -11,28 +11,18 @@ import numpy as np
 
 import etid
 from etid.circuits.circuit import AbstractCircuit, Circuit
-from etid.circuits.display import heading, per_cent, plus_minus, scaled, several
 from etid.circuits.lookup import class_path
-from etid.circuits.overview import Overview, Overviewed
-from etid.recordings.contents import natural
+from etid.printing import Overview, Overviewed, heading, per_cent, plus_minus, scaled, several
 from etid.recordings.errors import install
-from etid.recordings.fields import DESCRIBING, Label, check_names, wanted_labels
+from etid.recordings.labels import Label, check_names, natural, wanted_labels
+from etid.results.columns import DESCRIBED, LABELS, long_form, named, table_of
 from etid.results.data import with_data
-from etid.results.fit import Fit, Support
-from etid.results.fits_columns import (
-    DESCRIBED,
-    LABELS,
-    LIMITS,
-    SCHEMA,
-    VERSION,
-    columns_of,
-    long_form,
-)
+from etid.results.fit import Fit
+from etid.results.fits_file import SCHEMA, VERSION, fits_of
 from etid.results.hdf5_table import Table, opened_table, write_table
-from etid.results.instrument import Effects
 from etid.results.verdicts import counted, counts, left, message, own_part
 
-FEW = 5  # unusable fits that are explained
+FEW = 20  # unusable fits that are explained
 AND = " + "  # between the names of estimators
 
 
@@ -58,26 +48,25 @@ def concatenated(fits: Sequence[Fit]) -> Fit:
     used = [one.method for one in fits if np.isfinite(one.chi2).any()]
     method = joined(used or [one.method for one in fits])
     parts = [dataclasses.replace(one, method=method) for one in fits]
-    has = [name for name in OPTIONAL if any(getattr(one, name) is not None for one in parts)]
-    parts = [dataclasses.replace(one, **{of: _known(one, of) for of in has}) for one in parts]
+    for field in dataclasses.fields(parts[0]):
+        known = [of for one in parts if (of := getattr(one, field.name)) is not None]
+        if 0 < len(known) < len(parts):
+            parts = [_with(one, field.name, known[0]) for one in parts]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-OPTIONAL = ("limits", "change", "change_stderr", "support", "by_tolerance")  # fields of a fit
+def _with(fit: Fit, name: str, like: Any) -> Fit:
+    """Fits with a field; NaN, or limits that every value meets, if they do not have it.
 
-
-def _known(fit: Fit, name: str) -> Any:
-    """An optional field of fits; NaN, or limits that every value meets, if they do not have it."""
-    found, lanes, elements = getattr(fit, name), len(fit.rrse), len(fit.circuit.names())
-    if found is not None:
-        return found
-    nothing: dict[str, Any] = {
-        "limits": fit.all_limits,
-        **dict(zip(("change", "change_stderr"), fit.known_changes, strict=True)),
-        "support": Support.unknown(elements, lanes),
-        "by_tolerance": Effects.unknown(elements, lanes),
-    }
-    return nothing[name]
+    Args:
+        fit: Fits along one axis.
+        name: Name of the field.
+        like: The field of other fits.
+    """
+    if getattr(fit, name) is not None:
+        return fit
+    nothing = jax.tree.map(lambda leaf: np.full((len(fit.rrse), *leaf.shape[1:]), np.nan), like)
+    return dataclasses.replace(fit, **{name: fit.all_limits if name == "limits" else nothing})
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -130,9 +119,7 @@ class Fits(Overviewed, Generic[Circuit]):
         found = jax.tree.map(lambda leaf: np.asarray(leaf)[row], self.fit)
         if np.ndim(found.rrse):
             return found
-        labels = {
-            name: np.asarray(self.labels[name])[row] for name in DESCRIBED if name in self.labels
-        }
+        labels = {name: np.asarray(of)[row] for name, of in self.labels.items()}
         if self.measured is not None:
             labels["measured"] = self.measured[row]
         return with_data(found, labels)
@@ -218,8 +205,7 @@ class Fits(Overviewed, Generic[Circuit]):
                 take it: the columns `element`, `unit`, `value`, `stderr` and `change` in place of
                 those of the elements.
         """
-        labels = {name: self.labels[name] for name in DESCRIBED}
-        whole = labels | self.fit.table() | {"note": self.notes}
+        whole = table_of(self.fit, {**self.labels, "note": self.notes})
         return long_form(whole, self.circuit.units()) if long else whole
 
     def to_pandas(self, *, long: bool = False) -> Any:
@@ -280,30 +266,31 @@ class Fits(Overviewed, Generic[Circuit]):
             and len(set(zip(groups, self.labels[name].tolist(), strict=True))) > several
         ]
 
-    def _overview(self) -> Overview:
-        whole = self._medians()
-        return dataclasses.replace(whole, notes=[*whole.notes, *self._unusable()])
-
     def _unusable(self) -> list[str]:
-        """Path, verdict and first reason of the first `FEW` unusable fits."""
-        failed = np.flatnonzero(~self.fit.usable)
-        lines = []
-        for row in failed[:FEW].tolist():
-            verdict = str(self.verdicts[row])
-            why = own_part(verdict, str(self.notes[row])) or message(verdict, self.fit.of_impedance)
-            path = str(self.labels["path"][row])
-            why = why.removeprefix(f"{path!r}: ").partition(". ")[0].rstrip(".")
-            lines.append(f"{path or f'fit {row}'}: {verdict}. {why}.")
-        more = failed.size - len(lines)
-        return [*lines, *[f"… and {more} more unusable; fits.notes has all reasons"] * (more > 0)]
+        """Paths, verdict and note of the first `FEW` unusable fits; a message is said once."""
+        verdicts, of_spectra = self.verdicts.tolist(), self.fit.of_impedance
+        failed = np.flatnonzero(~self.fit.usable).tolist()
+        alike: dict[tuple[str, str], list[str]] = {}
+        for row in failed[:FEW]:
+            verdict, path = verdicts[row], str(self.labels["path"][row])
+            note = " ".join(str(self.notes[row]).split()).removeprefix(f"{path!r}: ")
+            why = verdict, note or message(verdict, of_spectra)
+            alike.setdefault(why, []).append(path or f"fit {row}")
+        lines, told = [], set()
+        for (verdict, note), paths in alike.items():
+            text = own_part(verdict, note, of_spectra) if verdict in told else note
+            lines.append(f"{', '.join(paths)}: {verdict}. {text}".rstrip())
+            told.add(verdict)
+        more = len(failed) - FEW
+        return [*lines, *[f"… and {more} more unusable; their notes say why"] * (more > 0)]
 
     @np.errstate(over="ignore", invalid="ignore")  # of a damaged file
-    def _medians(self) -> Overview:
-        """Title and table, without what is said of unusable fits."""
+    def _overview(self) -> Overview:
         units, groups = self.circuit.units(), self.summary("subject", "condition")
-        rows, usable = [], self.usable().circuit
+        rows, usable = [], self.usable()
         middle = {
-            name: np.median(of) if (of := getattr(usable, name)).size else np.nan for name in units
+            name: np.median(getattr(usable.circuit, name)) if len(usable) else np.nan
+            for name in units
         }  # each column has one unit
         for group in groups:
             where = " ".join(filter(None, (group["subject"], group["condition"])))
@@ -321,7 +308,7 @@ class Fits(Overviewed, Generic[Circuit]):
             f"{title}: {counted(self.verdicts)}" if len(self) else title,
             rows,
             ("", "usable", *(heading(name, of, middle[name]) for name, of in units.items())),
-            [medians, *pooled, *self._inexact()] if self.fit.usable.any() else [],
+            [*([medians, *pooled, *self._inexact()] if len(usable) else []), *self._unusable()],
         )
 
     def _inexact(self) -> list[str]:
@@ -335,13 +322,9 @@ class Fits(Overviewed, Generic[Circuit]):
 
     def as_table(self) -> tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]:
         """Columns of the file that `write` makes, their units, and its attributes."""
-        units = self.circuit.units()
-        units |= {f"{name}_stderr": unit for name, unit in units.items()}
-        units |= {name: field.unit for name, field in DESCRIBING.items() if field.unit}
-        columns = self.table() | {"cov": self.cov, "shared_cov": self.fit.shared_cov}
-        columns["change_stderr"] = self.fit.known_changes[1]
-        if self.fit.limits is not None:
-            columns |= {name: np.asarray(getattr(self.fit.limits, name)) for name in LIMITS}
+        columns = table_of(self.fit, {**self.labels, "note": self.notes}, file=True)
+        known = named(self.circuit.units())
+        units = {name: unit for name, (*_, unit) in known.items() if unit}
         attributes = {
             "schema": SCHEMA,
             "schema_version": VERSION,
@@ -381,9 +364,8 @@ class Fits(Overviewed, Generic[Circuit]):
         Raises:
             RecordingError: A column or an attribute is missing or invalid.
         """
-        kind, fields, labels, notes = columns_of(table, circuit)
-        elements = kind.of_fit([fields.pop(name) for name in kind.names()])
-        return Fits(Fit(circuit=elements, **fields), labels, notes)
+        fit, beside = fits_of(table, circuit)
+        return Fits(fit, beside, beside.pop("note"))
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a damaged file

@@ -8,7 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from etid.circuits.display import several
+from etid.printing import several
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import check_ending, replacing_hdf5

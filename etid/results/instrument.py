@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.directions import DIRECTIONS, ON_LOADS
-from etid.circuits.display import per_cent
-from etid.circuits.overview import Overview, Overviewed
 from etid.precision import Module, namespace
+from etid.printing import Overview, Overviewed, per_cent
 from etid.signals.transfer import AnyArray
 
 _Number = float | Float[Array | np.ndarray, ""]

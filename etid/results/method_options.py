@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from etid.circuits.display import quantity
+from etid.printing import quantity
 
 
 def options_of(method: str) -> tuple[str, dict[str, Any]]:

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.circuit import Circuit
-from etid.circuits.display import between, quantity, several
-from etid.circuits.overview import Overview, Overviewed
+from etid.printing import Overview, Overviewed, between, quantity, several
 from etid.solvers.importance_sampling import effective
 
 

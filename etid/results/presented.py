@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from etid.circuits.display import between, number, several
-from etid.circuits.overview import Overview
 from etid.precision import Module
+from etid.printing import Overview, between, number, several
 from etid.recordings.fields import LABELS
 from etid.results.method_options import fixed
 

@@ -23,8 +23,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Complex, Float
 
-from etid.circuits.display import per_cent, rounded, several
-from etid.circuits.overview import Overview, Overviewed
+from etid.printing import Overview, Overviewed, per_cent, rounded, several
 from etid.results.data import AnyAxes, Size, drawn
 
 LEVEL = 0.99  # of white residuals inside of the band

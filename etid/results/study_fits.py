@@ -20,9 +20,8 @@ import numpy as np
 
 import etid
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import rounded, several
-from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.precision import in_float64
+from etid.printing import ROWS, Overview, Overviewed, rounded, several
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of, words
 from etid.results.driver import (

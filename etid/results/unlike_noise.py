@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.circuits.display import per_cent, rounded
+from etid.printing import per_cent, rounded
 
 # By chance 1 spectrum in 4 000 has such runs, 5 of 1 000 000 of 40 frequencies such tails.
 RUNS, TAILS = 3.5, 2.5

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 
-from etid.circuits.display import per_cent, quantity, several
-from etid.circuits.overview import Overview, Overviewed
-from etid.recordings.fields import LABELS, check_names
+from etid.printing import Overview, Overviewed, per_cent, quantity, several
+from etid.recordings.fields import LABELS
+from etid.recordings.labels import check_names
 from etid.results.fits import Fits
 
 REST = "recordings"  # the last level: recordings with equal labels
@@ -72,21 +72,17 @@ class Variation(Overviewed):
         }
         # A search for the minimum at 0 ends near it.
         rows = [
-            (name, *(_per_cent(of) if of > 1e-3 * max(part) else "0 %" for of in part))
+            (name, *(per_cent(of) if of > 1e-3 * max(part) else "0 %" for of in part))
             for name, part in parts.items()
         ]
         of = f"each {self.driver}" if self.driver else "all"
-        rows.append(("error of a fit", _per_cent(self.error), "", ""))
-        rows.append((f"error of the driver of {of}", _per_cent(self.driver_error), "", ""))
+        rows.append(("error of a fit", per_cent(self.error), "", ""))
+        rows.append((f"error of the driver of {of}", per_cent(self.driver_error), "", ""))
         mean = quantity(self.mean, self.unit, self.stderr)
         title = f"{self.element} of {several(self.fits, 'fit')}: {mean}"
         names = ", ".join(self.unused)
         notes = [f"no groups of several fits by {names}"] if names else []
         return Overview(title, rows, ("variation", "standard deviation", "95 % from", "to"), notes)
-
-
-def _per_cent(part: float) -> str:
-    return f"{100 * part:.0f} %" if part >= 1 else per_cent(part)
 
 
 def variation(

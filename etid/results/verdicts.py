@@ -16,9 +16,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from etid.circuits.display import per_cent
-from etid.circuits.overview import Overviewed
 from etid.precision import Module, namespace
+from etid.printing import Overviewed, per_cent
 from etid.signals.transfer import AnyArray
 
 
@@ -238,9 +237,9 @@ def _of_codes(codes: Int[AnyArray, "*row"]) -> RESULTS:
 
 
 @functools.cache
-def own_part(verdict: str, note: str) -> str:
+def own_part(verdict: str, note: str, spectrum: bool = False) -> str:
     """What a note says beyond the message of its verdict."""
-    common = message(verdict)
+    common = message(verdict, spectrum)
     return " ".join((note.replace(common, " ") if common else note).split())
 
 

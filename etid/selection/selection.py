@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import several
-from etid.circuits.overview import Overview, Overviewed
+from etid.printing import Overview, Overviewed, several
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
 from etid.results.verdicts import message

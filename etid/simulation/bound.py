@@ -28,10 +28,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC, with_slopes
-from etid.circuits.display import per_cent
-from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.identify.arguments import require
 from etid.precision import array_function, in_float64, namespace
+from etid.printing import Overview, Overviewed, element_rows, per_cent
 from etid.signals.harmonics import whole_periods
 from etid.signals.rounding import COARSE, is_coarse, rounding_variance
 from etid.signals.transfer import AnyArray, power

@@ -18,8 +18,6 @@ import scipy
 from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.circuits.display import per_cent, rounded, several
-from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.rows import loads_of, source_of
@@ -31,6 +29,7 @@ from etid.likelihood.linear import diagonal, inverse
 from etid.likelihood.load import Near
 from etid.likelihood.source_prior import delay_std
 from etid.precision import array_function, in_float64, one_thread
+from etid.printing import Overview, Overviewed, per_cent, rounded, several
 from etid.recordings.hdf5 import read_calibrations
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording

@@ -35,9 +35,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import several
-from etid.circuits.overview import Overview, Overviewed
 from etid.precision import in_float64, namespace
+from etid.printing import Overview, Overviewed, several
 from etid.recordings.fields import LABELS, tidy_path
 from etid.recordings.recording import Recording, Samples
 from etid.recordings.study import Study

@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from etid.circuits.display import quantity
 from etid.precision import namespace
+from etid.printing import quantity
 from etid.signals.transfer import AnyArray
 from etid.simulation.electronics import Electronics
 

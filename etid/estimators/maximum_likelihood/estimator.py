@@ -7,7 +7,6 @@ from jaxtyping import Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.directions import DIRECTIONS
-from etid.circuits.display import per_cent
 from etid.estimators.element_limits import Limits, stated_limits
 from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import (
@@ -28,6 +27,7 @@ from etid.estimators.maximum_likelihood.rows import fit_lane, fit_rows
 from etid.estimators.maximum_likelihood.verdict import ACCEPT
 from etid.estimators.refined_driver import from_harmonics
 from etid.likelihood.of_calibrations import MISSING_POLE
+from etid.printing import per_cent
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.feed import AbstractFeed, MeasuredCurrent

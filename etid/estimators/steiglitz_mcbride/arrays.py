@@ -3,7 +3,6 @@
 from jaxtyping import Float
 
 from etid.circuits.discrete import Filter
-from etid.circuits.display import several
 from etid.estimators.steiglitz_mcbride.iteration import (
     ITERATIONS,
     check_iterations,
@@ -12,6 +11,7 @@ from etid.estimators.steiglitz_mcbride.iteration import (
     no_poles,
 )
 from etid.precision import array_function, in_float64, namespace, unmasked
+from etid.printing import several
 from etid.results.fit import rrse
 from etid.signals.filtering import from_rest
 from etid.signals.transfer import AnyArray, Rational

@@ -26,7 +26,6 @@ from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 
-from etid.circuits.display import several
 from etid.files.channel import (
     Contents,
     by_place,
@@ -37,6 +36,7 @@ from etid.files.channel import (
     with_unit,
 )
 from etid.files.readers import Reader
+from etid.printing import several
 from etid.recordings.recording import RecordingError
 
 ROWS = 1 << 16  # rows of text in memory at a time
