@@ -92,8 +92,13 @@ def plus_minus(value: float, error: float) -> str:
         return f"{value:10.7g} ± {0:<9}"
     if max(abs(value), error) >= 1e10:
         return f"{value:10.4g} ± {error:<9.2g}"
-    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
+    digits = _decimals(error)
     return f"{value:10.{digits}f} ± {error:<9.{digits}f}"
+
+
+def _decimals(size: float) -> int:
+    """Decimals that show two significant digits of a size; 0.0998 is 0.10."""
+    return min(max(1 - int(f"{size:.1e}".partition("e")[2]), 0), 9)
 
 
 def significant(value: float, digits: int = 2) -> str:
@@ -132,7 +137,7 @@ def between(low: float, high: float, unit: str) -> str:
     quarter = (high - low) / (4 * scale)
     if not (np.isfinite(quarter) and quarter > 0):
         return f"{low / scale:.4g} … {high / scale:.4g} {symbol}".rstrip()
-    digits = int(np.clip(1 - np.floor(np.log10(quarter)), 0, 9))
+    digits = _decimals(quarter)
     return f"{low / scale:.{digits}f} … {high / scale:.{digits}f} {symbol}".rstrip()
 
 

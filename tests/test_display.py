@@ -8,7 +8,7 @@ import re
 import pytest
 
 import etid
-from etid.printing import as_symbol, per_cent, quality, rounded, several, significant
+from etid.printing import as_symbol, per_cent, quality, quantity, rounded, several, significant
 from etid.report.html import Section, Table
 
 
@@ -43,6 +43,12 @@ def test_one_thing_is_no_several():
         "1 frequency",
         "3.5 frequencies",
     )
+
+
+def test_an_error_that_rounds_up_has_two_digits():
+    """The report had 185.794 ± 0.100 beside 185.80 ± 0.10."""
+    assert quantity(185.794e3, "ohm", 99.8) == "185.79 ± 0.10 kΩ"
+    assert per_cent(float("nan")) == "-"
 
 
 def test_what_diverges_predicts_nothing():
