@@ -2,15 +2,17 @@
 
 The tables of verdicts and remarks come from their messages, the tests from the table of directions,
 the command line from its parsers, and the reference from the names that `etid` and `etid.display`
-export.
+export. The report is that of the example, as `etid report` writes it.
 """
 
 import os
 import pathlib
 import re
+import tempfile
 import types
 
 import optimistix as optx
+from properdocs.structure.files import File
 
 import etid
 import etid.display
@@ -23,7 +25,18 @@ from etid.results import verdicts
 
 ROOT = pathlib.Path(__file__).parents[2]
 MARK = re.compile(r"^<!-- made: (\w+) -->$", re.MULTILINE)
+REPORT = "example_report.html"
 BORROWED = ("successful", "max_steps_reached", "nonfinite")  # from optimistix, see etid.RESULTS
+
+
+def on_files(files, config):
+    """Add the report of the example."""
+    with tempfile.TemporaryDirectory() as folder:
+        fits, page = (pathlib.Path(folder) / name for name in ("fits.h5", REPORT))
+        etid.fit_file(ROOT / "data_schema" / "example.h5", fits)
+        etid.write_report(fits, page)
+        files.append(File.generated(config, REPORT, content=page.read_text("utf-8")))
+    return files
 
 
 def on_page_markdown(markdown, page, config, files):
@@ -124,7 +137,13 @@ def _package(named):
     return name.split(".")[1]
 
 
+def report():
+    """The report of the example in a frame."""
+    return f'<iframe class="page" src="{REPORT}" title="The report of the example"></iframe>'
+
+
 MADE = {
+    "report": report,
     "verdicts": table_of_verdicts,
     "remarks": table_of_remarks,
     "tests": table_of_tests,
