@@ -57,10 +57,10 @@ class ResumeError(ValueError):
 
 
 @functools.cache
-def _drivers(sources: tuple[str, ...], stamps: tuple[int, ...], options: Options) -> dict[str, Any]:
-    """The drivers of a run that this process has identified: a worker gets its parts one by one."""
+def _drivers(sources: tuple[str, ...], stamps: tuple[int, ...], options: Options) -> Any:
+    """Drivers and failures of a run in this process: a worker gets its parts one by one."""
     del sources, stamps, options
-    return {"found": {}, "failures": {}}
+    return {}, {}
 
 
 def _opened(sources: tuple[str, ...]) -> Study:
@@ -93,7 +93,7 @@ def _fit_elsewhere(
     """The fits of one part, in any process that can read the files."""
     *_, options = run
     drivers = Drivers(study, options)
-    vars(drivers).update(_drivers(*run))
+    drivers.found, drivers.failures = _drivers(*run)
     return _fit(drivers, options, total, part)  # the file of a pickle is closed with it
 
 
