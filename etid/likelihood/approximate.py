@@ -45,22 +45,32 @@ class Approximation(NamedTuple):
         least: The minima.
         explains: Whether each change of `etid.likelihood.scores.changes` explains what the circuit
             leaves.
+        rough: Power of the noise, relative to what the recordings show (`roughness`).
+        exact: The recordings without δ, with this noise.
+        least_exact: Their minima.
     """
 
     load: Load
     least: Minimum
     explains: Mapping[str, Bool[np.ndarray, "row change"]]
+    rough: Float[np.ndarray, " row"]
+    exact: Load
+    least_exact: Minimum
 
 
-def approximated(load: Load, near: Near, start: Float[np.ndarray, "row q"]) -> Approximation:
+def approximated(load: Load, least: Minimum, start: Float[np.ndarray, "row q"]) -> Approximation:
     """Fits with δ.
 
     Args:
         load: Recordings without δ.
-        near: The likelihood near their minima.
+        least: Their minima.
         start: Other starts: weights of the noise may have led far away.
     """
-    left = _left(load, near)
+    left, rough = _left(load, least.near), roughness(load, least.near)
+    if (rough > 1).any():
+        load = load.louder(rough)
+        least = minimum(load, least.q[None])
+    exact, near = (load, least), least.near
     harmonics = load.records.x.shape[-1]
     flat = kernels(harmonics)[ORDINARY]
     of = with_delta(load, left[:, None, None] ** 2 * flat)
@@ -77,7 +87,7 @@ def approximated(load: Load, near: Near, start: Float[np.ndarray, "row q"]) -> A
     explains = dict(zip(changes, np.split(explained, ends, -1), strict=True))
     before, of = of, with_delta(load, found.covariance)
     least = minimum(of, _nearest(of, before, near.q)[None])
-    return Approximation(of, least, explains)
+    return Approximation(of, least, explains, rough, *exact)
 
 
 def departs(load: Load, near: Near) -> Bool[np.ndarray, " row"]:
@@ -86,17 +96,36 @@ def departs(load: Load, near: Near) -> Bool[np.ndarray, " row"]:
     No δ explains edges of a current that were not recorded where they are, or spikes.
     """
     smooth = is_smooth(near.condensed.part, load.gains.exact)
-    rows = np.flatnonzero(smooth)
-    if rows.size == 0:
-        return smooth
-    load, near = load.of(rows), taken(near, rows)
+    if (rows := np.flatnonzero(smooth)).size:
+        smooth[rows] = _is_explained(load.of(rows), taken(near, rows))
+    return smooth
+
+
+def roughness(load: Load, near: Near) -> Float[np.ndarray, " row"]:
+    """Mean square of what neither the circuits nor any δ explain; 1 where noise or δ explains all.
+
+    The edges of a current that was commanded are not where its samples say. This is no smooth
+    error, so it counts as noise, which is so much louder than that of the record.
+    """
+    left, count = _unexplained(load, near)
+    terms = near.condensed.part
+    left = left + 2 * near.profile.objective - (terms**2).sum(-1)  # of bins between two knots
+    mean = left / np.maximum(load.records.terms - count, 1)
+    return np.where(_is_explained(load, near), 1.0, np.maximum(mean, 1.0))
+
+
+def _is_explained(load: Load, near: Near) -> Bool[np.ndarray, " row"]:
+    """Whether some δ explains the smooth part of residuals."""
+    (left, _), terms = _unexplained(load, near), near.condensed.part
+    return left - SMOOTH * (terms != 0).sum(-1) < ROUGH * (terms**2).sum(-1)
+
+
+def _unexplained(load: Load, near: Near) -> tuple[Float[np.ndarray, " row"], int]:
+    """Squares of the condensed terms that no parameter and no δ explains; the number of these."""
     terms = near.condensed.part
     made = np.concatenate([_exact_rows(load, near.jacobian), _by_node(load, near)], 1)
     every = np.concatenate([np.nan_to_num(made), terms[:, None]], 1)
-    left = without(every @ every.swapaxes(-1, -2), made.shape[1])[:, 0, 0]
-    rough = left - SMOOTH * (terms != 0).sum(-1)
-    smooth[rows] = rough < ROUGH * (terms**2).sum(-1)
-    return smooth
+    return without(every @ every.swapaxes(-1, -2), made.shape[1])[:, 0, 0], made.shape[1]
 
 
 def _left(load: Load, near: Near) -> Float[np.ndarray, " row"]:

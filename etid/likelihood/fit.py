@@ -13,7 +13,7 @@ from etid.likelihood.approximate import approximated, departs, without_delta
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.linear import diagonal, inverse, replaced, taken
 from etid.likelihood.load import Load, Near
-from etid.likelihood.noise import excess, is_smooth, misses, pull_of_ignored, shows_hum
+from etid.likelihood.noise import MISFIT_CHI2, excess, misses, pull_of_ignored, shows_hum
 from etid.likelihood.profile import rrse
 from etid.likelihood.scores import Linear, Scores
 from etid.likelihood.search import Minimum, minimum, select
@@ -105,9 +105,9 @@ def fit(
     found = _estimate(load, least)._replace(logs=logs, delays=delays, z=z)
     if namespace(least.q) is not np or not inexact:
         return found
-    smooth = is_smooth(least.near.condensed.part, load.gains.exact)
-    if smooth.any() and (departing := departs(load, least.near)).any():
-        rows = np.flatnonzero(departing)
+    contradicted = found.other | found.inconsistent | misses(found.chi2, found.rrse)
+    inexact_rows = departs(load, least.near) | (found.chi2 > MISFIT_CHI2) & contradicted
+    if (rows := np.flatnonzero(inexact_rows)).size:
         of = taken(least, rows), starts[0, rows], taken(found, rows)
         return replaced(found, rows, _approximated(load.of(rows), *of))
     return found
@@ -117,25 +117,28 @@ def _approximated(
     load: Load, least: Minimum, start: Float[np.ndarray, "row q"], exact: Estimate
 ) -> Estimate:
     """The fits with δ, but for those in which something else explains what the circuit leaves."""
-    of = approximated(load, least.near, start)
+    of = approximated(load, least, start)
+    alone = _estimate(of.exact, of.least_exact) if (of.rough > 1).any() else exact
     found = _estimate(of.load, of.least)
     named = [
-        (DIRECTIONS[name].seen(*exact.tested[name][:3]) & of.explains[name]).any(-1)
+        (DIRECTIONS[name].seen(*alone.tested[name][:3]) & of.explains[name]).any(-1)
         for name in scores.named()
     ]
-    over = SHARE * (exact.chi2 - 1) * load.records.terms
+    over = SHARE * (alone.chi2 - 1) * load.records.terms
     for name in ("compressed current", "compressed voltage"):  # not smooth in frequency
-        if name in exact.tested:
-            one = exact.tested[name]
+        if name in alone.tested:
+            one = alone.tested[name]
             causes = DIRECTIONS[name].seen(*one[:3]) & (one.explained > over[:, None])
             named.append(causes.any(-1))
     if load.gains.outputs.count > 1:  # outputs that contradict each other are not averaged
-        named.append(exact.inconsistent)
-    other = np.any(named, 0) | exact.falls | misses(found.chi2, found.rrse) | ~found.settled
+        named.append(alone.inconsistent)
+    named_or_missed = np.any(named, 0) | exact.falls | misses(found.chi2, found.rrse)
+    other = named_or_missed | ~found.settled
     tested = {
         name: each._replace(others=without_delta(of.load, each.others))
         for name, each in found.tested.items()
     }
+    deviance = found.support.deviance + found.support.terms * np.log(of.rough)
     found = found._replace(
         tested=tested,
         chi2=exact.chi2,
@@ -143,7 +146,11 @@ def _approximated(
         falls=exact.falls,
         other=other,
         approximate=~other,
+        support=dataclasses.replace(found.support, deviance=deviance),
     )
+    if load.gains.outputs.count == 1:  # a contradiction that goes with δ is one of the circuit
+        both = exact.inconsistent & found.inconsistent
+        exact = exact._replace(inconsistent=both, other=exact.other | other)
     return select(other, exact, found)
 
 

@@ -65,6 +65,20 @@ class Load:
         of["ignored"] = None if self.ignored is None else self.ignored[rows]
         return dataclasses.replace(self, **of)
 
+    def louder(self, factor: Float[np.ndarray, " row"]) -> "Load":
+        """The same with so many times the power of all noise."""
+        records, unloaded, ignored = self.records, self.unloaded, self.ignored
+        factor = factor[:, None]
+        more = {
+            "variance_x": factor * records.variance_x,
+            "variance_y": factor[:, None] * records.variance_y,
+        }
+        if unloaded is not None:
+            unloaded = unloaded._replace(variance=factor * unloaded.variance)
+        of = {"records": records._replace(**more), "unloaded": unloaded}
+        of["ignored"] = None if ignored is None else factor * ignored
+        return dataclasses.replace(self, **of)
+
     @property
     def has_current(self) -> bool:
         """Whether the current through the load was measured."""

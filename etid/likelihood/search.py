@@ -46,7 +46,7 @@ IDLE = 3  # points in a row with a reduction below the rounding errors of ½ Σ 
 ROUNDING = 1e-6  # of ½ Σ r²
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
 WRONG = 1.5  # χ² of a minimum with states, from which on other starts are tried; wrong ones had 2.7
-SAME = 1.0  # largest difference of ½ Σ r² between two searches that have found one minimum
+SAME = 1.0  # variances of a term by which two searches differ that have found one minimum
 STEPS = 50  # largest number of steps at the knots of one point
 DISTANT = 0.1  # part of ½ Σ r² that a step promises, above which a point is distant
 ROUGHLY = 1e-3  # of ½ Σ r², which a step of a rough fit of a distant point reduces
@@ -137,7 +137,9 @@ def _searched_again(
         reduced = best.near.objective - other.near.objective
         best = select(reduced > 0, other, best)
         least = replaced(least, rows, best)
-        wrong[rows] = ~(fits(best, load.records.terms[rows]) | (abs(reduced) <= SAME))
+        terms = load.records.terms[rows]
+        alike = abs(reduced) <= SAME * np.maximum(best.near.objective / terms, 1.0)
+        wrong[rows] = ~(fits(best, terms) | alike)
     return least
 
 
