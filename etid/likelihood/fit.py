@@ -105,9 +105,9 @@ def fit(
     found = _estimate(load, least)._replace(logs=logs, delays=delays, z=z)
     if namespace(least.q) is not np or not inexact:
         return found
-    contradicted = found.other | found.inconsistent | misses(found.chi2, found.rrse)
-    inexact_rows = departs(load, least.near) | (found.chi2 > MISFIT_CHI2) & contradicted
-    if (rows := np.flatnonzero(inexact_rows)).size:
+    missed = found.other | found.inconsistent | misses(found.chi2, found.rrse)
+    departing = departs(load, least.near) | (missed & (found.chi2 > MISFIT_CHI2))
+    if (rows := np.flatnonzero(departing)).size:
         of = taken(least, rows), starts[0, rows], taken(found, rows)
         return replaced(found, rows, _approximated(load.of(rows), *of))
     return found
@@ -132,8 +132,8 @@ def _approximated(
             named.append(causes.any(-1))
     if load.gains.outputs.count > 1:  # outputs that contradict each other are not averaged
         named.append(alone.inconsistent)
-    named_or_missed = np.any(named, 0) | exact.falls | misses(found.chi2, found.rrse)
-    other = named_or_missed | ~found.settled
+    falls = exact.falls | alone.falls
+    other = np.any(named, 0) | falls | misses(found.chi2, found.rrse) | ~found.settled
     tested = {
         name: each._replace(others=without_delta(of.load, each.others))
         for name, each in found.tested.items()
@@ -143,7 +143,7 @@ def _approximated(
         tested=tested,
         chi2=exact.chi2,
         rrse=exact.rrse,
-        falls=exact.falls,
+        falls=falls,
         other=other,
         approximate=~other,
         support=dataclasses.replace(found.support, deviance=deviance),
@@ -151,7 +151,7 @@ def _approximated(
     if load.gains.outputs.count == 1:  # a contradiction that goes with δ is one of the circuit
         both = exact.inconsistent & found.inconsistent
         exact = exact._replace(inconsistent=both, other=exact.other | other)
-    return select(other, exact, found)
+    return select(other, exact._replace(falls=falls), found)
 
 
 class _Tested(NamedTuple):
