@@ -95,8 +95,8 @@ def main(arguments: argparse.Namespace) -> bool:
         return True
 
     def shown(name: str, fit: etid.Fit) -> etid.Fit:
-        print(f"{name}: {fit.verdict}, leaves {float(fit.rrse):.2%}; {', '.join(fit.elements)}",
-              flush=True)  # fmt: skip
+        head = f"{name}: {type(fit.circuit).__name__}, {fit.verdict}, leaves {float(fit.rrse):.2%}"
+        print(f"{head}; {', '.join(fit.elements)}", flush=True)
         return fit
 
     corner = f"{FILTER} {WIDTH:g}"
@@ -121,12 +121,12 @@ def main(arguments: argparse.Namespace) -> bool:
         named = f"sweeps of the model cell: scatter of {name} over ±"
         targets.append(Target(named, scatter / error, most=SCATTER))
     for name, one in list(tissue_recordings(folder).items())[: arguments.pairs]:
-        for circuit in (etid.SkinRC(), etid.SkinCole()):
-            fit = etid.identify_skin(one, circuit=circuit, throw=False)
-            shown(f"{name}, {type(circuit).__name__}", fit)
+        shown(name, etid.identify_skin(one, throw=False))
+        fit = shown(f"{name}, chosen", etid.identify_skin(one, circuit="auto", throw=False))
+        targets.append(Target(f"{name}: usable", float(fit.usable), 1.0))
     for circuit in ("R0-p(R1,C1)", "R0-p(R1,CPE1)"):
         fit = etid.identify_skin(battery(folder), circuit=circuit, throw=False)
-        shown(f"battery (kA), {circuit}", fit)
+        shown("battery (kA)", fit)
     for path in sorted((folder / "dummy_circuits_eis").glob("*.z")):
         fit = shown(path.stem, etid.identify_impedance(*etid.read_impedance(path), throw=False))
         of = dict(zip(fit.circuit.names(), SOLDERED[path.stem.split("_")[0]], strict=True))

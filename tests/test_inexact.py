@@ -105,7 +105,10 @@ def test_good_recordings_get_none(change, number, snr_db):
 
 @pytest.mark.parametrize(
     "change",
-    ["cole_alpha0.8", "two_rc_mid", "gain_-5%_skin", "driver_Lls_x1.2", "Rp_nonlinear_0.4"],
+    [
+        *("cole_alpha0.8", "two_rc_mid", "gain_-5%_skin", "driver_Lls_x1.2"),
+        *("Rp_nonlinear_0.2", "Rp_nonlinear_0.4"),
+    ],
 )
 def test_what_has_a_name_is_no_such_error(change):
     """It lies nearly in the span of the elements, which no residual can make good."""

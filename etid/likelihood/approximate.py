@@ -5,6 +5,9 @@ squares, while those of noise become few. Such loads get a δ (`etid.likelihood.
 size that the data say (`etid.likelihood.restricted`), and are fitted anew. Weights of the noise
 trust the strongest harmonics to 1e-4; an error of 0.2 % of the gain then costs 2 to 4 % in R_s and
 C_p, with δ 0.4 to 0.7 % (`python -m benchmarks inexact`).
+
+What no δ can make counts as noise of the same spectrum: its power is that of the squares which
+parameters and any δ leave. Edges of a current that was commanded are not at its samples.
 """
 
 import dataclasses
@@ -102,10 +105,9 @@ def departs(load: Load, near: Near) -> Bool[np.ndarray, " row"]:
 
 
 def roughness(load: Load, near: Near) -> Float[np.ndarray, " row"]:
-    """Mean square of what neither the circuits nor any δ explain; 1 where noise or δ explains all.
+    """Mean square of what neither parameters nor any δ explain, that of the noise being 1.
 
-    The edges of a current that was commanded are not where its samples say. This is no smooth
-    error, so it counts as noise, which is so much louder than that of the record.
+    It is 1 where noise or δ explains all.
     """
     left, count = _unexplained(load, near)
     terms = near.condensed.part
