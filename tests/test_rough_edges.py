@@ -68,3 +68,17 @@ def test_electrodes_on_tissue_are_nearly_a_cole_circuit(reference_data):
         fit = etid.identify_skin(recording, circuit=etid.SkinCole(), throw=False)
         assert fit.verdict == "approximate", path
         assert etid.identify_skin(recording, throw=False).verdict == "misfit"
+
+
+def test_the_budget_of_a_measured_current_has_noise_and_what_the_circuit_leaves():
+    """No driver, and no instrument that compares two voltages, adds anything."""
+    recording = commanded(COLE, 0, 0.2)
+    fit = etid.identify_skin(recording, circuit=etid.SkinCole())
+    budget = fit.budget()
+    assert set(budget.parts) == {"recording", "circuit"}
+    assert not budget.unstated
+    relative = np.array(fit.stderr.values()) / np.array(fit.circuit.values())
+    np.testing.assert_allclose(budget.together, relative, rtol=1e-9)
+    one = etid.identify_skins([recording], circuit=etid.SkinCole())[0]
+    # The same numbers, but for the rounding of a fit from the recording.
+    np.testing.assert_allclose(one.budget(recording).together, budget.together, rtol=1e-6)

@@ -46,6 +46,7 @@ from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
+from etid.results.feed import MEASURED_CURRENT
 from etid.results.fit import Fit
 from etid.results.instrument import BUDGETED, Budget, Effects
 from etid.results.method_options import fixed
@@ -351,7 +352,8 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
     effects = fit.by_tolerance
     if effects is None or not np.isfinite(effects.moved).any():
         effects = _effects(fit, *fit.source_or_own(recording, driver))
-    stated = dict(zip(BUDGETED, np.asarray(effects.stated).tolist(), strict=True))
+    by_driver = np.isfinite(effects.moved).any()  # not by a measured current
+    stated = dict(zip(BUDGETED, np.nan_to_num(np.asarray(effects.stated)).tolist(), strict=True))
     moved = zip(BUDGETED, np.asarray(effects.moved), strict=True)
     of = {name: part for name, part in moved if np.isfinite(part).all()}
     values = np.asarray(fit.circuit.values())
@@ -364,7 +366,7 @@ def budget(fit: Fit, recording: Recording | None, driver: Driver | None) -> Budg
         parts={
             "recording": np.sqrt(np.maximum(cov - shared - left**2, 0.0)),
             **({"circuit": left} if left.any() else {}),
-            "driver": np.sqrt(np.maximum(rest, 0.0)),
+            **({"driver": np.sqrt(np.maximum(rest, 0.0))} if by_driver else {}),
             **instrument,
         },
         tolerances=stated,
@@ -381,13 +383,13 @@ def _effects(fit: Fit, recording: Recording | None, driver: Driver | None) -> Ef
             "this joint fit has no budget: pass instrument=etid.Instrument() to identify_jointly, "
             "with the tolerances that you know; files of fits keep none"
         )
-    if not isinstance(driver, HarmonicDriver):
+    if driver is not None and not isinstance(driver, HarmonicDriver):
         raise ValueError(
             "a budget needs the driver of the fit, with the harmonics of its calibrations; "
             "identify it by maximum likelihood, and pass it as in fit.budget(recording, driver)"
         )
     lane, known, _ = given(fit, recording, driver, "fit.budget")
-    estimator = named(fit.method)
-    found = taken(fits_of([lane], driver, known.driver, fit.circuit, estimator), 0)
+    of = MEASURED_CURRENT if driver is None else driver, known.driver, fit.circuit
+    found = taken(fits_of([lane], *of, named(fit.method)), 0)
     assert found.by_tolerance is not None
     return found.by_tolerance

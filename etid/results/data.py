@@ -250,7 +250,7 @@ class HasSource(Generic[Circuit]):
         """What each source of error adds to the standard errors: noise, driver, instrument.
 
         It also shows what errors of the instrument would do that nobody stated, as in
-        `etid.Instrument`.
+        `etid.Instrument`. A measured current has no driver, and none of these errors.
 
         Args:
             recording: As in `plot`.
