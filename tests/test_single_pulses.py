@@ -83,7 +83,6 @@ def recordings(
     x = 1e-3 * first * steps / (2j * np.pi * f) / (1 + (f / (0.3 * rate)) ** 8)
     rng, n = np.random.default_rng(seed), round(periods * block)
     both = fault(f, x, np.asarray(skin.response(jnp.asarray(f))))
-    rng, n = np.random.default_rng(seed), round(periods * block)
 
     def noisy(spectrum: np.ndarray) -> np.ndarray:
         bins = np.pad(spectrum, (1, block // 2 - f.size))
@@ -115,6 +114,28 @@ def test_a_fault_of_one_record_is_refused_and_the_skin_itself_is_not():
         assert fit.chi2 < 1.25  # which shows none of them
         assert fit.verdict == verdict
         assert bool(fit.remarks & Remark.falls_with_current) == (fault is falling)
+
+
+@pytest.mark.parametrize(
+    ("size", "verdicts"),
+    [
+        (1e-3, {"successful"}),
+        (0.01, {"successful", "approximate"}),
+        (0.1, {"misfit", "inconsistent"}),
+    ],
+)
+def test_hum_during_one_pulse_is_in_the_errors_or_refused(size, verdicts):
+    """Its size is relative to V_out; 4.5 standard errors are one of ten thousand of 24 numbers."""
+    fits = []
+    for number, one in enumerate(recordings(SKINS["dry"], 8, snr_db=60.0)):
+        v_out, turn = np.asarray(one.v_out), np.random.default_rng(number).uniform()
+        time = np.arange(v_out.size) / one.sample_rate
+        added = np.sqrt(2) * size * v_out.std() * np.sin(2 * np.pi * (50.0 * time + turn))
+        fits.append(etid.identify_skin(one.replace(v_out=v_out + added), throw=False))
+    assert {fit.verdict for fit in fits} <= verdicts
+    for fit in fits if "misfit" not in verdicts else ():
+        off = np.subtract(fit.circuit.values(), SKINS["dry"].values())
+        assert (np.abs(off) < 4.5 * np.array(fit.stderr.values())).all()
 
 
 @pytest.mark.slow
