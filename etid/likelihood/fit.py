@@ -13,7 +13,7 @@ from etid.likelihood.approximate import approximated, departs, without_delta
 from etid.likelihood.gains import FAULTS
 from etid.likelihood.linear import diagonal, inverse, replaced, taken
 from etid.likelihood.load import Load, Near
-from etid.likelihood.noise import MISFIT_CHI2, excess, misses, pull_of_ignored, shows_hum
+from etid.likelihood.noise import MISFIT_CHI2, excess, is_smooth, misses, pull_of_ignored, shows_hum
 from etid.likelihood.profile import rrse
 from etid.likelihood.scores import Linear, Scores
 from etid.likelihood.search import Minimum, minimum, select
@@ -105,8 +105,10 @@ def fit(
     found = _estimate(load, least)._replace(logs=logs, delays=delays, z=z)
     if namespace(least.q) is not np or not inexact:
         return found
+    smooth = is_smooth(least.near.condensed.part, load.gains.exact)
+    departing = departs(load, least.near) if smooth.any() else smooth
     missed = found.other | found.inconsistent | misses(found.chi2, found.rrse)
-    departing = departs(load, least.near) | (missed & (found.chi2 > MISFIT_CHI2))
+    departing = departing | (missed & (found.chi2 > MISFIT_CHI2))
     if (rows := np.flatnonzero(departing)).size:
         of = taken(least, rows), starts[0, rows], taken(found, rows)
         return replaced(found, rows, _approximated(load.of(rows), *of))
