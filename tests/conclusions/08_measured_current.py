@@ -14,7 +14,6 @@ if cell is not None:
     assert cell.rrse < 0.002
 for selection in tissue.values():
     assert type(selection.fit.circuit) is etid.SkinCole
-    # With a χ² of 29 000 the last digits decide whether output error settles in its flat valley.
-    assert selection.fit.verdict in ("misfit", "max_steps_reached")
-    # Least squares in time leave 0.7 to 1.4 %, weights of the noise by frequency 1.0 to 1.9 %.
+    assert selection.fit.verdict == "approximate"
+    # Least squares in time leave 0.7 to 1.4 %, weights of the noise by frequency 0.8 to 1.8 %.
     assert selection.fit.rrse < 0.02
