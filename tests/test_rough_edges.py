@@ -34,7 +34,7 @@ def commanded(skin, number, late):
 def test_the_circuit_is_good_to_the_rest_and_errors_contain_it(skin, bounded, late):
     """The edges of such a pulse say how much charge it leaves, on which R_p behind one C_p rests.
 
-    Its errors are up to five of its ±, as `docs/limits.md` says; all others are within 3.3, which
+    Its errors are up to five of its ±, as `docs/inexact.md` says; all others are within 3.3, which
     a normal number exceeds in one of a thousand.
     """
     fits = [

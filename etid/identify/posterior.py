@@ -38,7 +38,7 @@ from etid.identify.arguments import fed, require
 from etid.identify.fitting import as_fitted, fits_of
 from etid.identify.spectrum import Spectrum, chain_of
 from etid.identify.spectrum_fit import Solved, Told, solved
-from etid.likelihood.approximate import approximated
+from etid.likelihood.approximate import approximated, departs
 from etid.likelihood.load import ROWS, Load
 from etid.likelihood.search import minimum
 from etid.precision import array_function, in_float64, one_thread
@@ -109,7 +109,8 @@ class Minimum(NamedTuple):
         rest = np.zeros(load.gains.exact - load.gains.elements)
         start = np.concatenate([np.log(circuit.values()), rest, load.gains.source.mean])
         found = minimum(load, start[None, None])
-        if fit.inexact:
+        # Of fits in a file, the verdict alone says it, and not that of a successful one.
+        if fit.inexact or (fit.usable and departs(load, found.near).any()):
             of = approximated(load, found, start[None])
             load, found = of.load, of.least
         rows, q = found.near.jacobian[0], found.q[0]

@@ -100,7 +100,8 @@ def departs(load: Load, near: Near) -> Bool[np.ndarray, " row"]:
     """
     smooth = is_smooth(near.condensed.part, load.gains.exact)
     if (rows := np.flatnonzero(smooth)).size:
-        smooth[rows] = _is_explained(load.of(rows), taken(near, rows))
+        near = taken(near, rows)
+        smooth[rows] = _is_smooth(near, _unexplained(load.of(rows), near)[0])
     return smooth
 
 
@@ -110,15 +111,15 @@ def roughness(load: Load, near: Near) -> Float[np.ndarray, " row"]:
     It is 1 where noise or δ explains all.
     """
     left, count = _unexplained(load, near)
+    # Beside the condensed terms, those of bins between two knots.
+    every = left + 2 * near.profile.objective - (near.condensed.part**2).sum(-1)
+    mean = every / np.maximum(load.records.terms - count, 1)
+    return np.where(_is_smooth(near, left), 1.0, np.maximum(mean, 1.0))
+
+
+def _is_smooth(near: Near, left: Float[np.ndarray, " row"]) -> Bool[np.ndarray, " row"]:
+    """Whether these squares, which no δ explains, are nothing beside those that some δ does."""
     terms = near.condensed.part
-    left = left + 2 * near.profile.objective - (terms**2).sum(-1)  # of bins between two knots
-    mean = left / np.maximum(load.records.terms - count, 1)
-    return np.where(_is_explained(load, near), 1.0, np.maximum(mean, 1.0))
-
-
-def _is_explained(load: Load, near: Near) -> Bool[np.ndarray, " row"]:
-    """Whether some δ explains the smooth part of residuals."""
-    (left, _), terms = _unexplained(load, near), near.condensed.part
     return left - SMOOTH * (terms != 0).sum(-1) < ROUGH * (terms**2).sum(-1)
 
 

@@ -150,10 +150,11 @@ def _approximated(
         approximate=~other,
         support=dataclasses.replace(found.support, deviance=deviance),
     )
+    exact = exact._replace(falls=falls)
     if load.gains.outputs.count == 1:  # a contradiction that goes with δ is one of the circuit
         both = exact.inconsistent & found.inconsistent
-        exact = exact._replace(inconsistent=both, other=exact.other | other)
-    return select(other, exact._replace(falls=falls), found)
+        exact = exact._replace(inconsistent=both, other=other)
+    return select(other, exact, found)
 
 
 class _Tested(NamedTuple):

@@ -67,17 +67,12 @@ class Load:
 
     def louder(self, factor: Float[np.ndarray, " row"]) -> "Load":
         """The same with so many times the power of all noise."""
-        records, unloaded, ignored = self.records, self.unloaded, self.ignored
-        factor = factor[:, None]
-        more = {
-            "variance_x": factor * records.variance_x,
-            "variance_y": factor[:, None] * records.variance_y,
-        }
-        if unloaded is not None:
-            unloaded = unloaded._replace(variance=factor * unloaded.variance)
-        of = {"records": records._replace(**more), "unloaded": unloaded}
-        of["ignored"] = None if ignored is None else factor * ignored
-        return dataclasses.replace(self, **of)
+        factor, records, unloaded = factor[:, None], self.records, self.unloaded
+        of_y = factor[:, None] * records.variance_y
+        records = records._replace(variance_x=factor * records.variance_x, variance_y=of_y)
+        unloaded = unloaded and unloaded._replace(variance=factor * unloaded.variance)
+        ignored = None if self.ignored is None else factor * self.ignored
+        return dataclasses.replace(self, records=records, unloaded=unloaded, ignored=ignored)
 
     @property
     def has_current(self) -> bool:
