@@ -406,3 +406,15 @@ def test_what_is_not_smooth_is_no_error_of_the_gain():
     assert is_smooth(near.condensed.part, load.gains.exact).all()
     assert not departs(load, near).any()
     assert etid.identify_skin(one, throw=False).verdict == "misfit"
+
+
+def test_a_successful_fit_of_a_file_finds_it_in_the_recording():
+    """Its verdict does not tell that ± contain it, and files keep no effects."""
+    fits, _, driver, (record, *_) = fits_of("δ0.0005 2", 40)
+    known = fits[record.path]
+    of_file = dataclasses.replace(known, by_tolerance=None)
+    assert known.verdict == "successful"
+    assert known.inexact
+    assert not of_file.inexact
+    whole, again = (one.profile("r_s", record, driver) for one in (known, of_file))
+    np.testing.assert_allclose(again.interval(), whole.interval(), rtol=1e-9)
